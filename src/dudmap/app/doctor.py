@@ -19,13 +19,13 @@ from dudmap.version import __version__
 COMPILING = "compiling the kernels (once, one to two minutes; dudmap warmup does it in advance)"
 
 PYTHON = ((3, 11), (3, 14))
-"""First supported version of Python, and first unsupported one."""
+"""First supported and first unsupported version of Python."""
 PORT = 8080
 """Port of the page of --view."""
 FEATURES = ("avx2", "fma")
-"""Instruction sets of x86-64 processors since 2013 that speed up the kernels."""
+"""Instruction sets that speed up the kernels, in x86-64 processors since 2013."""
 FREE_BYTES = 2**31
-"""Smallest free space of a folder: a map and the results of a long run."""
+"""Smallest free space of a folder, bytes: a map and the results of a long run."""
 State = Literal["good", "note", "bad"]
 
 
@@ -34,7 +34,7 @@ class Check:
     """Result of a check.
 
     Attributes:
-        state: "good"; "note" limits a part of the program; "bad" stops it.
+        state: "good"; "note" limits a part; "bad" stops the program.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Check:
 
 
 def checks() -> Iterator[Check]:
-    """Run all checks; all are quick: they compile nothing and use no network."""
+    """Run all checks, without compiling and network."""
     yield _python()
     yield from _packages()
     yield _processor()
@@ -188,7 +188,7 @@ def _port() -> Check:
 
 
 def not_writable(folder: Path) -> str:
-    """Why a folder, or its nearest existing parent, cannot be written; empty if it can."""
+    """Why a folder, or its nearest existing parent, is not writable; empty if it is."""
     place = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
     try:
         with tempfile.TemporaryFile(dir=place):
@@ -200,7 +200,7 @@ def not_writable(folder: Path) -> str:
 
 
 def requirements() -> list[tuple[str, str, str]]:
-    """Name, lowest version and extra (empty: required) of the packages that dudmap needs on this system."""
+    """Name, lowest version and extra (empty: required) of needed packages."""
     found: dict[tuple[str, str], str] = {}
     for line in requires("dudmap") or []:
         name = re.match(r"[A-Za-z0-9._-]+", line)

@@ -1,4 +1,4 @@
-"""Print text and the log without interpreting control characters or markup in file names."""
+"""Print text and log without control characters or markup."""
 
 import logging
 from collections.abc import Callable, Iterator
@@ -26,7 +26,7 @@ def lines(text: str) -> str:
 
 
 def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Console
-    """Console that prints texts as ``printable`` and without markup; only ``rich.text.Text`` has styles."""
+    """Console for ``printable`` texts without markup, except ``rich.text.Text``."""
     from rich.console import Console  # imported here, because it takes a third of the start time
 
     class PlainConsole(Console):
@@ -39,12 +39,12 @@ def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Conso
 
 @cache
 def stderr_console() -> "Console":
-    """Console on stderr that progress bars and the log share, so that messages appear above the bar."""
+    """Console on stderr of progress bars and log."""
     return plain_console(stderr=True)
 
 
 class TerminalHandler(logging.Handler):
-    """Prints each message of the log as a line on stderr; warnings are marked."""
+    """Prints log messages on stderr; marks warnings."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a message."""
@@ -56,10 +56,7 @@ class TerminalHandler(logging.Handler):
 
 
 def show_log(*, quiet: bool = False, verbose: bool = False) -> None:
-    """Print the log ``dudmap`` on stderr: the messages of a run, with ``quiet`` warnings alone, with ``verbose`` all.
-
-    The core logs each loss of the camera by its time; a run logs the same by the number of the frame.
-    """
+    """Print the log ``dudmap`` on stderr: a run's messages, with ``quiet`` warnings, with ``verbose`` all."""
     log, core = logging.getLogger("dudmap"), logging.getLogger("dudmap.core")
     if not any(isinstance(handler, TerminalHandler) for handler in log.handlers):
         log.addHandler(TerminalHandler())
@@ -69,8 +66,7 @@ def show_log(*, quiet: bool = False, verbose: bool = False) -> None:
 
 @contextmanager
 def counted(name: str, *, quiet: bool, console: "Console | None" = None) -> Iterator[Callable[[int, int], None]]:
-    """Show a progress bar on stderr, if it is a terminal; yield a function of the numbers of finished and of all
-    frames.
+    """Progress bar on a terminal's stderr; yields a function of finished and all frames. A spinner shows activity.
 
     A spinner and the seconds show activity while kernels compile.
     """

@@ -194,10 +194,7 @@ def _trajectory(path: Path, times: NDArray[np.float64], file: PoseFile) -> Traje
 
 
 class TrueSurface(NamedTuple):
-    """True static surface of a recording in the world frame of its ground truth.
-
-    Attributes:
-    """
+    """True static surface of a recording in the world frame of its ground truth."""
 
     path: Path
     whole: Mesh

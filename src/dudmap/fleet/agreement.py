@@ -1,4 +1,4 @@
-"""Agreement of two maps at a relative pose: the surface of one that the other confirms, denies, or never saw."""
+"""Agreement of two maps: surface of one that the other confirms, denies, or never saw."""
 
 from dataclasses import dataclass
 
@@ -11,30 +11,29 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.map_samples import EMPTY, IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
 
 CELL = 0.25
-"""Edge of the cells in which mean surface colours are compared, metres."""
+"""Cells of mean surface colours, metres."""
 MIN_CELL_POINTS = 8
-"""Fewest points of a cell with a mean colour."""
+"""Fewest points of a cell."""
 MIN_COLORED = 200
-"""Fewest points with colours in both maps for a comparison of colours."""
+"""Fewest points with colours in both maps."""
 MAX_COLOR_DIFFERENCE = 20.0
-"""Largest difference of a cell's mean colours that agree, per channel, after its gain, grey levels."""
+"""Largest difference of agreeing mean colours, per channel, after gain, grey levels."""
 
 MIN_AREA, MIN_OVERLAP = 1.0, 0.1
-"""Smallest common surface: square metres, and share of the surface of the smaller map."""
+"""Smallest common surface: square metres, and share of the smaller map's."""
 CLEAR_DISTANCE = 0.1
-"""Smallest distance of denied surface from all surface of the other map, metres: drift, noise and bending shift
-surface by centimetres."""
+"""Distance of denied from all other surface, metres, above drift, noise and bending."""
 MAX_DENIED = 0.01
-"""Largest share of the compared surface in free space of the other map. Measured: 0 to 0.006 for one place, 0.0185
-to 0.12 for moved furniture, 0.006 to 0.024 for similar floors."""
+"""Largest share of compared surface in the other's free space. Measured: 0 to 0.006 for one place, 0.0185 to 0.12 for
+moved furniture, 0.006 to 0.024 for similar floors."""
 MAX_CHANGED = 0.5
-"""The same share for two visits between which things may have moved."""
+"""The same for two visits with changes."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
-"""Smallest correlation of intensities, and smallest share of cells with agreeing colours. Measured: 0.995 and 1.0
-for one rendered room; 0.86 and 0.80 with other textures on small things."""
+"""Correlation of intensities, and share of cells with agreeing colours: 0.995 and 1.0 for one rendered room; 0.86 and
+0.80 with other small textures."""
 MAX_OTHER_COLOR, MAX_OTHER_SHARE = 0.1, 0.003
-"""Largest surface with disagreeing colours, square metres, or this share of the common surface, for pairs among many
-runs: similar places differ by single things. Similar floors have at least 0.35 m2, maps of one floor up to 0.05 m2."""
+"""Surface with other colours, square metres, or share of the common surface, among many runs: one floor has up to 0.05
+m2, similar floors 0.35."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +41,12 @@ class Agreement:
     """Comparison of the surfaces of two maps.
 
     Attributes:
-        area: Surface that both maps have at the same place, square metres (mean of both directions).
-        overlap: That surface as a share of the smaller map's surface.
-        denied: Share of the compared surface, near enough to a camera, in known free space of the other map; the larger
-            of both directions.
-        color_correlation: Correlation of the intensities of the common surface.
-        color_share: Share of the cells of the common surface whose mean colours agree.
-        other_color: Common surface in the other cells, square metres.
+        area: Common surface, square metres (mean of both directions).
+        overlap: Its share of the smaller map's surface.
+        denied: Share of the compared surface, near a camera, in the other's free space; the larger direction.
+        color_correlation: Of the common surface's intensities.
+        color_share: Share of its cells with agreeing mean colours.
+        other_color: Surface in the other cells, square metres.
     """
 
     area: float
@@ -60,14 +58,13 @@ class Agreement:
 
     @property
     def enough(self) -> bool:
-        """Whether the common surface is large enough for a comparison."""
+        """Whether the common surface suffices."""
         return self.area >= MIN_AREA and self.overlap >= MIN_OVERLAP
 
     def rejection_reason(self, many: bool = False, changed: bool = False) -> str:
-        """Sentence on the first check that fails, empty if the maps can be merged.
+        """Sentence on the first failed check, empty if the maps can be merged.
 
-        ``many``: one of many runs. ``changed``: two visits, whose things may have moved, been painted or lit
-        differently.
+        ``many``: one of many runs. ``changed``: two visits with changes of things, paint or light.
         """
         if not self.enough:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
@@ -76,7 +73,7 @@ class Agreement:
         return self.color_reason(many, 0.0 if changed else MIN_COLOR_SHARE)
 
     def color_reason(self, many: bool, min_share: float = MIN_COLOR_SHARE) -> str:
-        """Sentence on how the colours disagree, empty if they agree in at least ``min_share`` of the cells."""
+        """Sentence on disagreeing colours, empty if at least ``min_share`` of the cells agree."""
         if self.color_correlation < MIN_CORRELATION or self.color_share < min_share:
             return (
                 f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "
@@ -90,7 +87,7 @@ class Agreement:
 def agreement(
     a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
 ) -> Agreement:
-    """Compare two maps by surface points at a relative pose ``T_a_b`` (4, 4), world of b to world of a."""
+    """Compare two maps by surface points at ``T_a_b`` (4, 4), world of b to a."""
     common_b, denied_b, color_a = _compared(a, of_a, of_b, T_a_b)
     common_a, denied_a, color_b = _compared(b, of_b, of_a, se3.inverse(T_a_b))
     area = (common_b.sum() * of_b.area_each + common_a.sum() * of_a.area_each) / 2
@@ -111,8 +108,6 @@ def _share(denied: NDArray[np.bool_], common: NDArray[np.bool_]) -> float:
 def _compared(
     volume: TsdfVolume, own: SurfacePoints, surface: SurfacePoints, T: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-    """Points (n,) of a surface that a map confirms, those it denies, and its colours (m, 3). Points behind the
-    surface are neither: a map need not hold both sides of a plate."""
     points = transformed(T, surface.points)
     samples = sample_map(volume, points)
     known = samples.state == OBSERVED
@@ -128,7 +123,6 @@ def _color_agreement(
     colors_b: NDArray[np.float64],
     areas: NDArray[np.float64],
 ) -> tuple[float, float, float]:
-    """Correlation of intensities of points (n, 3), share of cells with agreeing colours, area of the others."""
     known = (colors_a.max(axis=1) > 0) & (colors_b.max(axis=1) > 0)
     if np.count_nonzero(known) < MIN_COLORED:
         return 0.0, 0.0, 0.0

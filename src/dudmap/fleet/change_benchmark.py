@@ -37,15 +37,15 @@ ONCE = ("door", "poster")
 KINDS = {"moved": 0.45, "appeared": 0.275, "disappeared": 0.275}
 PATHS = ("handheld", "pan", "orbit", "dolly")
 NONE, PEOPLE, LIGHT = 0.2, 0.2, 0.3
-"""Shares of the pairs without any change, with people in the second visit, and with other light."""
+"""Shares of the pairs without change, with people in the second visit, with other light."""
 SAME = 0.06
-"""Distance at which found and true surface coincide, metres: three voxels and the noise at 3 m."""
+"""Distance of coinciding found and true surface, metres: three voxels and the noise at 3 m."""
 SAME_MOTION_CM = 5.0
-"""Largest motion error at which a thing hardly seen by one visit counts as correctly found to have moved."""
+"""Largest motion error of a thing hardly seen by one visit, cm."""
 LEAST_SHARE = 0.5
-"""Smallest share of a found surface on the surface of a true change for the two to match."""
+"""Smallest share of a found surface on a matching true change."""
 IOU_CELL = 0.04
-"""Edge of the cells that compare found and true surface, metres."""
+"""Cells that compare found and true surface, metres."""
 SMALL = 0.15
 FRAMES, FPS, SIZE = 60, 12.0, (320, 240)
 
@@ -73,7 +73,7 @@ def draw_pair(seed: int, number: int) -> dict[str, Any]:
 
 
 def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[TrueChange]]:
-    """Recordings and true changes of a pair, without things that find no free place."""
+    """Recordings and true changes of a pair, without things that find no place."""
     while True:
         try:
             return visits(**pair)
@@ -84,7 +84,7 @@ def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[T
 
 
 def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path, arguments: str = "") -> list[Path]:
-    """Run folders of both visits; reuses runs of an earlier call with the same ``arguments``."""
+    """Run folders of both visits, reused for equal ``arguments``."""
     folders, note = [out / "before", out / "after"], out / "pair.json"
     if note.is_file() and note.read_text(encoding="utf-8") == arguments:
         return folders
@@ -97,10 +97,9 @@ def run_pair(recordings: list[SyntheticSequence], config: Config, out: Path, arg
 def score_pair(
     changes: Sequence[Change], truth: Sequence[TrueChange], T_scene_before: NDArray[np.float64]
 ) -> dict[str, Any]:
-    """Match found to true changes; return matches with their errors, and the kinds of false changes.
+    """Match found to true changes; return matches with errors, and kinds of false changes.
 
-    ``T_scene_before`` (4, 4) maps the found changes to the frame of the true ones. True changes of kind "unknown" count
-    neither as missed nor as false.
+    ``T_scene_before`` (4, 4) maps found to true frame; true changes of kind "unknown" do not count.
     """
 
     def surface(one: TrueChange | Change) -> NDArray[np.float64]:
@@ -155,7 +154,7 @@ def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
 
 
 def measure_pair(pair: dict[str, Any], config: Config, min_size: float, keep: Path | None = None) -> dict[str, Any]:
-    """Render, run and compare one pair; return its row. ``keep`` is a folder that keeps the run folders."""
+    """``keep``: folder that keeps the runs."""
     recordings, truth = rendered_pair(pair)
     row: dict[str, Any] = {"scene": pair["scene"], "seed": pair["seed"], "people": pair["people"]}
     with tempfile.TemporaryDirectory() as folder:
@@ -173,10 +172,7 @@ def measure_pair(pair: dict[str, Any], config: Config, min_size: float, keep: Pa
 def measure_insertions(
     recording: Recording, seed: int, count: int, config: Config, min_size: float, done: Callable[[dict[str, Any]], None]
 ) -> list[dict[str, Any]]:
-    """Insert ``count`` things into the second half of a real recording; return their rows.
-
-    In every other row the halves are swapped, so that the thing disappears.
-    """
+    """Insert ``count`` things into the second half of a real recording (swapped in every other row); return rows."""
     rng, middle, rows = np.random.default_rng([seed, 35]), len(recording) // 2, []
     halves = range(middle), range(middle, len(recording))
     with tempfile.TemporaryDirectory() as folder:
@@ -203,7 +199,6 @@ def measure_insertions(
 
 
 def _stood(visit: Visit, rng: np.random.Generator, size: float) -> list[Primitive]:
-    """A box on a level surface in view of a visit, with free space around it."""
     up, mesh, camera = vertical(visit), visit.mesh, visit.volume.camera
     level = np.flatnonzero(mesh.normals @ up > 0.95)
     for vertex in rng.permutation(level)[:5000]:
@@ -237,8 +232,8 @@ def measure_changes(
 ) -> tuple[list[dict[str, Any]], str]:
     """Measure ``count`` pairs; write changes.md, .csv and .json to ``out``; return the rows and the table.
 
-    The pairs are rendered, or are the halves of ``recording`` (``measure_insertions``). ``given`` overrides drawn
-    arguments of ``visits``. ``keep`` is a folder that keeps the runs of rendered pairs for reuse.
+    Pairs are rendered, or the halves of ``recording`` (``measure_insertions``). ``given`` overrides arguments of
+    ``visits``; ``keep``: folder for reuse of runs.
     """
     rows = [] if recording is None else measure_insertions(recording, seed, count, config, min_size, done)
     for number in range(count) if recording is None else ():

@@ -1,7 +1,7 @@
-"""Surface that stayed in place and got other colours: a poster, a screen, a painted wall.
+"""Surface in place with other colours: a poster, a screen, a painted wall.
 
-Light changes brightness smoothly, paint abruptly. Colours are averaged over small cells, and a gain is fitted to the
-cells around each cell. A remaining difference above the spread of all cells marks other colours.
+Light changes smoothly: a gain is fitted to the cells around each cell. A difference above the spread of all cells marks
+other colours.
 """
 
 import numpy as np
@@ -13,18 +13,18 @@ from dudmap.fleet.change_evidence import CONFIRMED, DEVIATIONS, Evidence
 from dudmap.fleet.change_objects import Piece, connected, facing, is_wide
 
 CELL, CELL_VOXELS = 0.05, 4
-"""Smallest edge of the cells in which colours are averaged, metres and voxels: several pixels."""
+"""Smallest edge of colour cells, metres and voxels."""
 AROUND = 0.6
-"""Radius of constant light, metres; a poster fills less than half of it."""
+"""Radius of constant light, metres."""
 LEAST_POINTS, LEAST_AROUND = 6, 12
-"""Fewest vertices of a compared cell, and fewest cells that determine the light."""
+"""Fewest vertices of a cell, and cells that determine the light."""
 LEAST_DIFFERENCE = 20.0
-"""Smallest difference of changed cell colours, grey levels; the limit of agreeing cells in a merge."""
+"""Smallest colour difference of changed cells, grey levels; a merge's limit."""
 CHROMA, CORRELATION, TEXTURE = 0.05, 0.4, 8.0
-"""Changes that light does not cause: this difference of the shares of red, green and blue, or a lower correlation of
-textures of at least this standard deviation (grey levels)."""
+"""Changes not caused by light: difference of the shares of red, green and blue, or lower correlation of textures above
+a standard deviation (grey levels)."""
 SOLID = 0.7
-"""Smallest recoloured share of the surface within a change's extent: highlights are scattered."""
+"""Smallest recoloured share of a change's extent, unlike highlights."""
 
 
 def recolored_pieces(
@@ -66,7 +66,6 @@ def recolored_pieces(
 
 
 def _different(centres: NDArray[np.float64], own: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Cells (n,) whose colours (n, 3) differ by more than noise and light explain."""
     logs = np.log((own + 8) / (other + 8))
     near = KDTree(centres).query(centres, k=64, distance_upper_bound=AROUND)[1]
     padded = np.concatenate([logs, np.full((1, 3), np.nan)])[near]
@@ -78,7 +77,6 @@ def _different(centres: NDArray[np.float64], own: NDArray[np.float64], other: ND
 
 
 def _is_paint(own: NDArray[np.float64], other: NDArray[np.float64], light: NDArray[np.float64]) -> bool:
-    """Whether colours (n, 3) of a piece differ by more than light with gains (3,) explains."""
     shares = [(colors + 8) / (colors + 8).sum(axis=1, keepdims=True) for colors in (own, other * light)]
     if np.abs(np.median(shares[0], axis=0) - np.median(shares[1], axis=0)).max() > CHROMA:
         return True

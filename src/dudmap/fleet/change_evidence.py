@@ -1,9 +1,8 @@
-"""Compare the surface of one map with another map of the same place.
+"""Compare the surface of one map with another of the same place.
 
-Every vertex of one mesh is confirmed, denied, behind a surface, or not seen by the other map. It is denied if the other
-map has free space there and no surface within the noise of both maps. The noise is one voxel plus three standard
-deviations of the local noise. This is the larger of the sensor's noise and the spread of the distances between both
-surfaces nearby, which includes alignment and bending.
+Every vertex is confirmed, denied, behind a surface, or not seen by the other map: denied in free space without surface
+within the noise of both maps, one voxel plus three standard deviations of the local noise: the larger of the sensor's
+and the spread of nearby distances.
 """
 
 from dataclasses import dataclass
@@ -25,21 +24,21 @@ from dudmap.core.places.saved_map import SavedMap
 from dudmap.fleet.map_samples import EMPTY, OBSERVED, MapSamples, sample_map, transformed
 
 UNKNOWN, CONFIRMED, DENIED, BEHIND = 0, 1, 2, 3
-"""State of a vertex in the other map: not seen; on a surface; in free space; behind a surface."""
+"""State of a vertex in the other map."""
 DEVIATIONS = 3.0
-"""Standard deviations within which noise explains a distance."""
+"""Standard deviations within noise."""
 MAX_VIEWS, VIEWS = 24, 3
-"""Poses of a visit that are rendered; number of them that must look through a place."""
+"""Rendered poses of a visit, and how many must look through a place."""
 CELL = 0.5
-"""Edge of the cells in which the noise between surfaces is estimated, metres: the size of furniture."""
+"""Cells of the noise between surfaces, metres: the size of furniture."""
 MIN_CELL_POINTS = 50
-"""Fewest vertices of a cell with its own noise estimate."""
+"""Fewest vertices of a cell with its own noise."""
 MAX_NOISE = 2.0
-"""Largest local noise in multiples of the whole place's: it limits cells in which most of the surface moved."""
+"""Largest local noise over the place's, against moved surface."""
 EDGE_PIXELS = 2.0
-"""Width of a depth edge in pixels, and in voxels: measurements there mix both surfaces."""
+"""Width of a depth edge, pixels and voxels."""
 READINGS = 2
-"""Observations of emptiness, each of the carving weight, that make a place free."""
+"""Observations of emptiness, of the carving weight, of a free place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +48,13 @@ class Evidence:
     Attributes:
         mesh: Surface in the common frame.
         state: (V,) uint8.
-        gap: (V,) float32, distance to the nearest surface of the other map, metres; 0 within the noise.
-        tolerance: (V,) distance that noise explains, metres.
-        blur: (V,) width of a depth edge, metres: at least two pixels and two voxels, plus the noise.
-        weight: (V,) float32, of the own map.
+        gap: (V,) float32, distance to the other surface, metres; 0 within the noise.
+        tolerance: (V,) noise, metres.
+        blur: (V,) width of a depth edge, metres: two pixels and two voxels, plus noise.
+        weight: (V,) float32.
         min_weight: Smallest weight of the mesh.
-        other_color: (V, 3) float32, colour of the other map at confirmed vertices, else 0.
-        cameras: (k, 3) camera positions of the own visit, metres, common frame.
+        other_color: (V, 3) float32, at confirmed vertices, else 0.
+        cameras: (k, 3) of the own visit, metres, common frame.
     """
 
     mesh: Mesh
@@ -83,7 +82,7 @@ class Evidence:
 
     @cached_property
     def parts(self) -> NDArray[np.intp]:
-        """Component number (V,) of each vertex in the mesh without confirmed faces."""
+        """Component (V,) of each vertex without confirmed faces."""
         faces = self.mesh.faces[np.all(self.state[self.mesh.faces] != CONFIRMED, axis=1)]
         return components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(self.state))
 
@@ -95,8 +94,8 @@ class Visit:
     Attributes:
         T_common_map: (4, 4).
         mesh: Its surface in the common frame.
-        keyframes: (k, 4, 4) poses of its keyframes in the common frame.
-        views: (n, 4, 4) camera poses spread over the visit, in the common frame.
+        keyframes: (k, 4, 4) poses, common frame.
+        views: (n, 4, 4) poses spread over the visit, common frame.
     """
 
     volume: TsdfVolume
@@ -157,10 +156,10 @@ def evidence(own: Visit, other: Visit) -> Evidence:
 
 
 def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Number of views (n,) of a visit that look through points (n, 3) of the common frame at a surface behind them.
+    """Views (n,) that look through points (n, 3), common frame, at a surface farther than twice a margin (n,), metres,
+    in the pixel and its neighbours.
 
-    It must lie farther than twice a margin (n,), metres, behind the point, in the pixel and its neighbours. Views are
-    rendered because the map stores free space per block only.
+    Rendered, because the map has free space per block only.
     """
     import cv2
 
@@ -176,21 +175,21 @@ def times_seen_through(visit: Visit, points: NDArray[np.float64], margin: NDArra
 
 
 def components(pairs: NDArray[np.integer], count: int) -> NDArray[np.intp]:
-    """Number (count,) of the connected component of each node of a graph with edges (n, 2)."""
+    """Connected component (count,) of each node of a graph (n, 2)."""
     graph = csr_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return connected_components(graph, directed=False)[1]
 
 
 def surface_tree(points: NDArray[np.floating]) -> KDTree:
-    """Unbalanced tree of surface points (n, 3), built in a third of the time of a balanced one."""
+    """Unbalanced tree of points (n, 3), built in a third of the time."""
     return KDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def noise_share(
     points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Standard deviation (n,) of the distances (n,) between two surfaces around points (n, 3). It is 1.48 times the
-    median absolute distance below a limit (n,) in a cell, at least the value of the whole place."""
+    """Standard deviation (n,) of distances (n,) between surfaces: 1.48 times a cell's median below a limit (n,), at
+    least the place's."""
     near = np.abs(np.nan_to_num(distances, nan=np.inf)) < limit
     if not near.any():
         return np.ones(len(points))

@@ -1,11 +1,11 @@
-"""Find the motion of a thing between two visits: from a missing surface in one map to a new surface in the other.
+"""Motion of a thing between two visits: from a missing to a new surface.
 
-Start motions bring a point onto a point of similar colour and slope, with a turn about the vertical. ICP refines them
-in both directions, by point-to-plane distances (Chen and Medioni 1992) and intensities along the surface (Park et al.
-2017). Neighbours are searched by position and colour (Johnson and Kang 1997). A prior keeps the tilt small.
+Start motions bring points onto points of similar colour and slope, turned about the vertical. ICP refines in both
+directions, by point-to-plane distances (Chen and Medioni 1992) and intensities (Park et al. 2017), with neighbours by
+position and colour (Johnson and Kang 1997) and a prior on tilt.
 
-The score is the close surface with similar colours minus the surface moved into free space. Motions not significantly
-worse than the best make it ambiguous.
+The score is close surface of similar colours minus surface moved into free space. Motions not significantly worse than
+the best make it ambiguous.
 """
 
 from dataclasses import dataclass, replace
@@ -23,59 +23,53 @@ from dudmap.fleet.map_samples import transformed
 
 Array = NDArray[np.float64]
 PAIRS, STARTS = 20_000, 1000
-"""Random pairs of points; start motions taken from them."""
 RANKED, COARSE, FINE = 60, 300, 1500
-"""Surface points for ranking starts, for the coarse registration, and for the fine registration and its score."""
+"""Surface points for ranking starts, coarse and fine registration."""
 TRIED, REFINED, NEAR, NEAR_DEG = 24, 4, 0.05, 10.0
-"""Starts registered coarsely; motions registered finely; distance of one motion (m, degrees)."""
+"""Starts registered coarsely, and finely; distance of one motion (m, degrees)."""
 ICP_ROUNDS, STOP = 20, 1e-3
-"""Steps of a registration, and the twist (m, rad) that ends it."""
+"""Registration steps, and final twist (m, rad)."""
 TILT = np.radians(0.3)
-"""Standard deviation of the tilt of a thing between two visits, radians: from level surfaces and the bending of
-maps."""
+"""Standard deviation of a thing's tilt between visits, radians."""
 FACE = 0.1
-"""Edge of the patches that count as one measurement each, metres: calibration and map shift whole faces."""
+"""Patches that count as one measurement, metres."""
 PATCH, DEVIATIONS_APART = 0.05, 2.0
-"""Edge of the patches with independent scores, metres. Standard errors by which a worse sum is significant."""
+"""Patches with independent scores, metres; standard errors of a significantly worse sum."""
 COLOR_LENGTH = 0.3
-"""Length equivalent to black minus white in the neighbour search (Johnson and Kang 1997), share of the size."""
+"""Length of black minus white in the neighbour search (Johnson and Kang 1997), share of the size."""
 COLOR_GATE = 50.0
 COLOR_SCALE = 15.0
-"""Colour difference at which the Cauchy weight of a match falls to one half, grey levels."""
+"""Colour difference of Cauchy weight one half, grey levels."""
 PULL = 0.05
-"""Weight of the point-to-point distance relative to point-to-plane: it keeps flat surfaces from sliding."""
+"""Weight of point-to-point over point-to-plane: flat surfaces do not slide."""
 NEIGHBOURS = 12
-"""Points from which the gradient of the intensity along a surface is estimated."""
+"""Points for the intensity gradient."""
 DEVIATIONS, LEAST_NOISE = (2.0, 3.0), (1e-3, 4.0)
-"""Residuals, in standard deviations, at which Geman-McClure weights fall to a quarter, for distances and intensities.
-Smallest standard deviations assumed (m, grey levels)."""
+"""Residuals of Geman-McClure weight a quarter, standard deviations, for distances and intensities; smallest standard
+deviations (m, grey levels)."""
 LIGHT, DAMPING = 0.2, 0.02
-"""Difference of log intensities at which the weight of the light falls to a quarter. Damping of its direction per
-point."""
+"""Log intensity difference of weight a quarter; damping of the light's direction per point."""
 MIN_POINTS = 60
-"""Fewest matched points that determine a motion."""
+"""Fewest matched points of a motion."""
 LEAST_FIT, LEAST_SEEN, LEAST_EXPLAINED = 0.8, 0.25, 0.05
-"""Smallest shares of matched surface: of the surface that matches or lies in free space, of the larger body. Smallest
-explained share of the former."""
+"""Smallest matched share of surface that matches or lies in free space, of the larger body; smallest explained share of
+the former."""
 PLAIN, MAX_CHROMA = 5.0, 0.04
-"""Largest median colour difference of an untextured thing under one light, grey levels; largest difference of the
-shares of red, green and blue."""
+"""Median colour difference of an untextured thing, grey levels; difference of the shares of red, green and blue."""
 TEXTURE, LEAST_CORRELATION = 8.0, 0.5
-"""Standard deviation of intensities above which a surface has texture, grey levels; smallest correlation of equal
-textures."""
+"""Standard deviation of a texture's intensities, grey levels; smallest correlation of equal textures."""
 FLAT = 0.05
-"""Second eigenvalue of the mean outer product of normals below which the matched points are one flat face."""
+"""Second eigenvalue of the mean outer product of normals of one flat face."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Surface of a thing in one map: the part that the other map denies, and its surroundings.
+    """Surface of a thing in one map: its denied part and surroundings.
 
     Attributes:
         points, normals: (n, 3) float64, common frame.
         colors: (n, 3) float64, 0..255.
-        denied: (n,) bool, the part that the other map denies.
-        tolerance: Distance that noise explains, metres.
+        tolerance: Noise, metres.
     """
 
     points: Array
@@ -86,8 +80,7 @@ class Body:
 
     @classmethod
     def of(cls, found: Evidence, piece: Piece) -> "Body":
-        """Surface in the box of a piece, and connected points within one piece length that may be hidden in the other
-        map."""
+        """Surface in a piece's box, and connected points within its length, perhaps hidden in the other map."""
         points, margin = found.points, float(np.median(found.tolerance[piece.vertices]))
 
         def within(far: float) -> NDArray[np.bool_]:
@@ -112,7 +105,7 @@ class Body:
 
     @cached_property
     def slopes(self) -> Array:
-        """Gradients (n, 3) of the intensities along the surface, grey levels per metre, from the nearest points."""
+        """Intensity gradients (n, 3) along the surface, grey levels per metre."""
         n, near = self.normals, self.tree.query(self.points, k=min(NEIGHBOURS, len(self.points)))[1]
         apart = self.points[near] - self.points[:, None]
         apart -= np.einsum("nkj,nj,ni->nki", apart, n, n)
@@ -138,11 +131,11 @@ class Motion:
     Attributes:
         T_after_before: (4, 4), common frame.
         fit: Matched share of the surface that matches or lies in free space.
-        explained: Vertices of both surfaces that the motion explains minus vertices that it moves into free space.
-        scores: (n,) ``explained`` per patch of the surfaces.
-        is_likely: Whether both surfaces may belong to one thing.
+        explained: Vertices of both surfaces explained minus moved into free space.
+        scores: (n,) ``explained`` per patch.
+        is_likely: Whether both may be one thing.
         ambiguous: Why another motion is equally likely, else None.
-        sigma: Standard deviations of the position of the thing's centre (m) and of the rotation (rad).
+        sigma: Standard deviations of the centre (m) and rotation (rad).
     """
 
     T_after_before: Array
@@ -154,16 +147,13 @@ class Motion:
     sigma: tuple[float, float] = (np.inf, np.inf)
 
     def is_worse(self, best: "Motion") -> bool:
-        """Whether it explains significantly less than the best motion (paired t-test over patches)."""
+        """Whether it explains significantly less (paired t-test over patches)."""
         less = best.scores - self.scores
         return bool(less.sum() > DEVIATIONS_APART * np.sqrt(len(less)) * less.std())
 
 
 def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Array) -> Motion | None:
-    """Find the motion from the missing to the new surface; None if they are not one thing.
-
-    ``up`` (3,) is the vertical, about which upright things turn.
-    """
+    """Motion from the missing to the new surface; None if they are not one thing. ``up`` (3,): vertical."""
     coarse, fine = (_Meeting((after, before), (missing, new), up, count) for count in (COARSE, FINE))
 
     def judged(meeting: _Meeting, starts: list[Array], gate: float) -> list[Motion]:
@@ -186,11 +176,11 @@ def motion_between(before: Visit, after: Visit, missing: Body, new: Body, up: Ar
 
 
 class _Meeting:
-    """Matched points of two bodies under a motion from the first to the second.
+    """Matched points of two bodies under a motion.
 
     Args:
-        up: (3,) axis about which things turn.
-        count: Most points of each denied surface that are matched.
+        up: (3,) axis of turns.
+        count: Matched points of each denied surface.
     """
 
     def __init__(self, there: tuple[Visit, Visit], bodies: tuple[Body, Body], up: Array, count: int) -> None:
@@ -208,10 +198,9 @@ class _Meeting:
         self.trees = [KDTree(np.hstack([body.points, self.shade * body.colors])) for body in self.others]
 
     def starts(self) -> list[Array]:
-        """Candidate motions (4, 4), by decreasing number of points with a neighbour.
+        """Candidate motions (4, 4), most points with a neighbour first.
 
-        Each brings a point onto one of the second body with a similar colour. The turn about the vertical aligns their
-        normals, and is random for vertical ones.
+        Each matches one point of similar colour; normals, or chance for vertical ones, give the turn.
         """
         (a, b), up, rng, out = self.sources, self.up, np.random.default_rng(1), list[Array]()
         gate = max(0.1 * self.size, 3 * self.gate)
@@ -238,7 +227,7 @@ class _Meeting:
         return [out[n] for n in np.argsort(-scores, kind="stable")]
 
     def different(self, poses: list[Array], distance: float, angle_deg: float) -> list[Array]:
-        """Motions (4, 4) without later ones that bring the centre of the thing to about the same pose."""
+        """Motions (4, 4) without later ones of about the same pose."""
         centre, kept = np.eye(4), list[Array]()
         centre[:3, 3] = self.sources[0].points.mean(axis=0)
         for T in poses:
@@ -247,7 +236,6 @@ class _Meeting:
         return kept
 
     def registered(self, T: Array, gate: float) -> Array:
-        """Refine a motion (4, 4) by ICP with a shrinking gate (m)."""
         for _ in range(ICP_ROUNDS):
             pairs = self._pairs(T, max(gate, self.gate))
             if len(pairs.moved) < 10:
@@ -260,7 +248,6 @@ class _Meeting:
         return T
 
     def sigma(self, T: Array) -> tuple[float, float]:
-        """Standard deviations of a motion (4, 4): of the centre of the matched points (m) and of the rotation (rad)."""
         pairs, about = self._pairs(T, self.gate), np.eye(6)
         about[:3, 3:] = se3.hat(pairs.moved.mean(axis=0))
         variances = np.diag(np.linalg.inv(about.T @ self._normal_equations(pairs, T)[0] @ about))
@@ -282,7 +269,6 @@ class _Meeting:
         return _Pairs(*(np.concatenate(part) for part in zip(*rows, strict=True)))
 
     def _normal_equations(self, pairs: "_Pairs", T: Array) -> tuple[Array, Array]:
-        """Normal equations for a left twist of a motion (4, 4), from matches and a robust prior on the tilt."""
         H, g = pairs.normal_equations()
         tilt, level = np.cross(self.up, T[:3, :3] @ self.up), np.eye(3) - np.outer(self.up, self.up)
         weight = np.square(1 / TILT / (1 + np.square(np.linalg.norm(tilt) / (DEVIATIONS[0] * TILT))))
@@ -320,9 +306,6 @@ class _Meeting:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Moved points (n, 3) of one surface and their intensities (n,); matched points on the other surface with normals,
-    intensities and intensity gradients."""
-
     moved: Array
     mine: Array
     points: Array
@@ -331,10 +314,6 @@ class _Pairs:
     slopes: Array
 
     def normal_equations(self) -> tuple[Array, Array]:
-        """Matrix (6, 6) and gradient (6,) for the left twist that aligns the matches.
-
-        Terms: point to plane and intensity, with Geman-McClure weights scaled by their noise, and weak point to point.
-        """
         off, H, g = self.moved - self.points, 1e-9 * np.eye(6), np.zeros(6)
         share = len(np.unique(np.floor(self.moved / FACE), axis=0)) / len(self.moved)
         shade = self.shades + (off * self.slopes).sum(axis=1) - _gains(self.mine, self.shades, self.normals) * self.mine
@@ -353,8 +332,7 @@ class _Pairs:
 
 
 def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
-    """Gains (n,) from intensities (n,) under one light to another; log-linear in the normals (n, 3) (Basri and
-    Jacobs 2003)."""
+    """Gains from one light to another, log-linear in the normals (Basri and Jacobs 2003)."""
     A, y = np.hstack([np.ones((len(mine), 1)), normals]), np.log((theirs + 8) / (mine + 8))
     x, damping = np.array([np.median(y), 0, 0, 0]), DAMPING * len(y) * np.diag([0, 1.0, 1, 1])
     for _ in range(3):
@@ -364,8 +342,7 @@ def _gains(mine: Array, theirs: Array, normals: Array) -> Array:
 
 
 def _alike(mine: Array, theirs: Array, patches: NDArray[np.intp]) -> bool:
-    """Whether two surfaces have the colours of one thing, averaged over patches (n,): fine texture is lost at a
-    distance."""
+    """Whether two surfaces have one thing's colours, averaged over patches."""
     patches, counts = np.unique(patches, return_inverse=True, return_counts=True)[1:]
     mine, theirs = (
         np.stack([np.bincount(patches, x) for x in colors.T], axis=1) / counts[:, None] for colors in (mine, theirs)

@@ -1,4 +1,4 @@
-"""Group denied surface into things, and select the certain and recoloured ones."""
+"""Group denied surface into things; select certain and recoloured ones."""
 
 from dataclasses import dataclass
 
@@ -9,21 +9,21 @@ from scipy.spatial import Delaunay, KDTree
 from dudmap.fleet.change_evidence import CONFIRMED, DENIED, Evidence, Visit, components, surface_tree
 
 LINK = 4.0
-"""Gap between pieces of one thing, voxels."""
+"""Gap within a thing, voxels."""
 REACH = 0.5
-"""Gap between parts of one thing without observed free space between them, in lengths of the larger piece."""
+"""Gap between parts without observed free space, in lengths of the larger piece."""
 SLIM, OUTLINE = 0.5, 1.1
-"""Largest width of a leg relative to its height; factor that widens the observed outline of a thing."""
+"""Width of a leg over its height; factor of a thing's outline."""
 LEAST_FACE = 0.3
-"""Smallest area of a change in squares of the smallest size: a cube may show part of one face."""
+"""Area of a change in squares of the smallest size."""
 LEAST_FACING = 0.1
-"""Smallest median cosine between the normals of a change and the best keyframe's ray."""
+"""Median cosine between a change's normals and the best keyframe's ray."""
 LEAST_COVER = 0.125
-"""Smallest share of the larger face of its box that a change fills: edge fragments are scattered."""
+"""Share of its box's larger face that a change fills, unlike edge fragments."""
 CLEAR = 2.0
-"""Smallest median gap between a change and the other surface, in noise tolerances."""
+"""Median gap of a change, noise tolerances."""
 CERTAIN = 3
-"""A change is certain if its median weight is this multiple of the smallest weight of the mesh."""
+"""Median weight of a certain change, smallest mesh weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +31,7 @@ class Piece:
     """Connected surface of one map that the other denies.
 
     Attributes:
-        vertices: (n,) int, numbers of its vertices in the mesh of the evidence.
+        vertices: (n,) int, vertices of the mesh.
         points: (n, 3) float64, metres, common frame.
         area: Square metres.
     """
@@ -52,17 +52,13 @@ class Piece:
 
 
 def denied_pieces(found: Evidence, voxel_size: float, min_size: float) -> list[Piece]:
-    """Pieces of surface that the other map denies beyond the noise, the largest first, without small ones."""
+    """Pieces of denied surface, largest first, without small ones."""
     pieces = connected(found, opened(found, found.state == DENIED), LINK * voxel_size)
     return [piece for piece in pieces if piece.area > LEAST_FACE * min_size**2]
 
 
 def assembled(pieces: list[Piece], own: Visit, up: NDArray[np.float64]) -> list[Piece]:
-    """Join pieces with their smaller parts and legs, largest first.
-
-    A part has no observed free space between it and the piece: something occluded its middle. Legs are as thin as a
-    pixel.
-    """
+    """Join pieces with smaller parts and thin legs, largest first. Parts were occluded in between."""
     out: list[Piece] = []
     for piece in sorted(pieces, key=lambda one: -one.area):
         for n in reversed(range(len(out))):
@@ -73,12 +69,12 @@ def assembled(pieces: list[Piece], own: Visit, up: NDArray[np.float64]) -> list[
 
 
 def is_part(piece: Piece, thing: Piece, own: Visit) -> bool:
-    """Whether a piece may be part of a larger one: it is near, and its visit saw no free space between them."""
+    """Whether a piece may be part of a near larger one, without observed free space between them."""
     return gap_between(thing, piece) < REACH * thing.length and is_hidden_between(thing, piece, own)
 
 
 def carries(piece: Piece, thing: Piece, up: NDArray[np.float64]) -> bool:
-    """Whether a piece is a leg of a thing: a slim column within its outline, seen along ``up`` (3,)."""
+    """Whether a piece is a leg of a thing: a slim column within its outline along ``up`` (3,)."""
     across = np.linalg.svd(up[None])[2][1:].T
     leg, outline = piece.points @ across, thing.points[:: max(1, len(thing.points) // 2000)] @ across
     height = np.ptp(np.percentile(piece.points @ up, [2, 98]))
@@ -90,7 +86,7 @@ def carries(piece: Piece, thing: Piece, up: NDArray[np.float64]) -> bool:
 
 
 def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
-    """Whether the visit saw no free space on half of the shortest lines between two pieces."""
+    """Whether half of the shortest lines between two pieces show no free space."""
     some, steps = b.points[:: max(1, len(b.points) // 200)], np.linspace(0, 1, 20)[:, None]
     gap, near = KDTree(a.points).query(some)
     ways = np.argsort(gap)[: max(5, len(some) // 5)]
@@ -100,7 +96,7 @@ def is_hidden_between(a: Piece, b: Piece, own: Visit) -> bool:
 
 
 def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
-    """Whether a piece is large, wider than depth edges, and seen often enough from the front."""
+    """Whether a piece is large, wider than depth edges, and well seen."""
     if np.median(found.weight[piece.vertices]) < CERTAIN * found.min_weight:
         return False
     if np.median(found.gap[piece.vertices] / found.tolerance[piece.vertices]) < CLEAR:
@@ -113,7 +109,7 @@ def is_certain(piece: Piece, found: Evidence, min_size: float) -> bool:
 
 
 def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Some vertices (n,) of a piece, and the cosine (n,) of its best viewing angle; negative from behind."""
+    """Some vertices (n,) of a piece, and cosines (n,) of the best viewing angle; negative from behind."""
     vertices = piece.vertices[:: max(1, len(piece.vertices) // 500)]
     rays = found.cameras[:, None] - found.points[vertices]
     cosines = (rays * found.mesh.normals[vertices]).sum(axis=2) / np.linalg.norm(rays, axis=2)
@@ -121,7 +117,7 @@ def facing(found: Evidence, piece: Piece) -> tuple[NDArray[np.intp], NDArray[np.
 
 
 def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
-    """Whether points (n, 3) extend beyond a length and a width (m) along their first two principal axes."""
+    """Whether points (n, 3) exceed a length and a width (m) along their principal axes."""
     points = points[:: max(1, len(points) // 2000)]
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     low, high = np.percentile(points @ axes.T, [2, 98], axis=0)
@@ -130,7 +126,7 @@ def is_wide(points: NDArray[np.float64], length: float, width: float) -> bool:
 
 
 def opened(found: Evidence, flagged: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Remove flagged vertices (V,) on the blurred edge of confirmed surface; vertices near the remaining core stay."""
+    """Remove flagged vertices (V,) on the blurred edge of confirmed surface, except near the remaining core."""
     numbers, points = np.flatnonzero(flagged), found.points
     against = (found.state == CONFIRMED) & ~flagged
     if len(numbers):
@@ -149,7 +145,7 @@ def opened(found: Evidence, flagged: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def connected(found: Evidence, chosen: NDArray[np.bool_], gap: float) -> list[Piece]:
-    """Groups of chosen vertices (V,) with gaps of about at most ``gap`` (m), the largest first."""
+    """Groups of chosen vertices (V,) with gaps up to ``gap`` (m), largest first."""
     numbers, points = np.flatnonzero(chosen), found.points[chosen]
     if len(numbers) == 0:
         return []
@@ -161,7 +157,7 @@ def connected(found: Evidence, chosen: NDArray[np.bool_], gap: float) -> list[Pi
 
 
 def gap_between(a: Piece, b: Piece) -> float:
-    """Distance of the nearest points of two pieces, metres; the distance of their boxes if it exceeds 1 m."""
+    """Distance of two pieces, metres; of their boxes beyond 1 m."""
     apart = float(np.linalg.norm(np.maximum(np.maximum(a.box[0] - b.box[1], b.box[0] - a.box[1]), 0)))
     return apart if apart > 1 else float(KDTree(a.points).query(b.points)[0].min())
 

@@ -1,4 +1,4 @@
-"""Page of changes: both maps in 3D with tinted changes, and pictures of each change before and after."""
+"""Page of changes: both maps in 3D, and pictures of each change."""
 
 import base64
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ PICTURES = 40
 
 
 def tinted(mesh: Mesh, changes: Sequence[Change], side: str) -> Mesh:
-    """Mesh of a visit ("before" or "after") with changes tinted by kind."""
+    """Mesh of a visit ("before" or "after") with tinted changes."""
     colors = mesh.colors.astype(np.float64)
     for change in changes:
         piece = getattr(change, side)
@@ -38,7 +38,7 @@ def tinted(mesh: Mesh, changes: Sequence[Change], side: str) -> Mesh:
 def change_page(
     tree: dict[str, Any], meshes: Sequence[Mesh], visits: Sequence[Visit], poses: Sequence[NDArray[np.float64] | None]
 ) -> str:
-    """HTML text of the page. A change is rendered from its pose (4, 4) in the common frame, if it has one."""
+    """HTML text of the page. Changes are rendered from their poses (4, 4), common frame."""
     data, texts = [], []
     for mesh in meshes:
         about, text = packed(simplified(mesh, TRIANGLES))
@@ -71,7 +71,7 @@ def change_page(
 
 
 def motion_and_confidence(row: dict[str, Any]) -> str:
-    """Text on the motion of a thing, if it moved, and the confidence."""
+    """Text on a thing's motion and confidence."""
     moved = ""
     if "distance" in row:
         moved = f", moved by {100 * row['distance']:.1f} ± {100 * row['distance_sigma']:.1f} cm"

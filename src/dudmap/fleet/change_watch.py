@@ -1,4 +1,4 @@
-"""Report changes against the map of an earlier visit during a run."""
+"""Report changes against an earlier map during a run."""
 
 import json
 from pathlib import Path
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
 
 WATCH_FILE = "changes.jsonl"
 CELL = 0.05
-"""Edge of the cells in which evidence is counted, metres."""
+"""Cells of evidence, metres."""
 COLUMNS = 80
-"""Pixels per image row that are compared."""
+"""Compared pixels per row."""
 FRAMES, SECONDS = 6, 0.75
-"""Frames for a change, minus frames against it, and the time they must span, seconds, to exclude passers-by."""
+"""Frames for minus against a change, and their time, seconds: no passers-by."""
 LEAST_CELLS = 3.0
-"""Smallest reported change in cells, in multiples of the cells on a face of the smallest size."""
+"""Smallest change in cells, in faces of the smallest size."""
 KINDS = ("appeared", "disappeared")
 
 
 class _Cells:
-    """Frames for and against a change in cells; cells are added on demand.
+    """Frames for and against a change in cells.
 
     Attributes:
         codes: (n,) int64 Morton codes, ascending.
-        score: (n,) frames for a change minus frames against it.
+        score: (n,) frames for minus against.
         first, last: (n,) seconds.
         reported: (n,) bool.
     """
@@ -50,7 +50,6 @@ class _Cells:
         self.reported = np.zeros(n, bool)
 
     def rows_of(self, points: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Rows of the cells of points (n, 3); new cells are added."""
         codes = np.unique(morton.encode(np.floor(points / CELL).astype(np.int64)))
         new = np.setdiff1d(codes, self.codes, assume_unique=True)
         if len(new):
@@ -61,25 +60,22 @@ class _Cells:
         return np.searchsorted(self.codes, codes)
 
     def count(self, rows: NDArray[np.intp], gain: int, now: float) -> None:
-        """Count one frame for (1) or against (-1) a change in cells."""
         fresh = rows[self.score[rows] <= 0]
         self.first[fresh], self.last[rows] = now, now
         self.score[rows] = np.maximum(self.score[rows] + gain, 0)
 
     def certain(self) -> NDArray[np.intp]:
-        """Rows of the cells that are certain and not reported."""
         return np.flatnonzero((self.score >= FRAMES) & (self.last - self.first >= SECONDS) & ~self.reported)
 
 
 class ChangeWatch(RunObserver):
-    """Writes changes.jsonl into the run folder: an object per change with id, kind, box, centre, timestamp and frame.
+    """Writes changes.jsonl: id, kind, box, centre, timestamp and frame per change.
 
-    Even frames search new surface in the earlier map's free space, odd frames earlier surface that is looked through. A
-    change that later frames deny is written again as "withdrawn". Each is also an event "change" of the other
-    observers.
+    Even frames search new surface in the earlier free space, odd ones earlier surface that is looked through. Later
+    denied changes are written again as "withdrawn". Each is an event "change".
 
     Args:
-        before: Map of the earlier visit; it must not be the map that the run updates.
+        before: Earlier map, not the one that the run updates.
         min_size: Edge of the smallest thing, metres.
     """
 
@@ -96,7 +92,7 @@ class ChangeWatch(RunObserver):
         self._slam: Slam | None = None
 
     def start(self, slam: "Slam", out: Path | None, count: int | None) -> None:
-        """A pass begins; without a folder no file is written."""
+        """A pass begins; without a folder nothing is written."""
         self._slam, self.reported, self._members = slam, [], {}
         self._cells = self._fresh()
         self._close()
@@ -112,7 +108,7 @@ class ChangeWatch(RunObserver):
             self.look(index, read.frame, result)
 
     def look(self, index: int, frame: Frame, result: "FrameResult") -> None:
-        """Count the evidence of a tracked frame, and report changes that are now certain."""
+        """Count the evidence of a tracked frame, and report certain changes."""
         T = result.T_world_camera
         if T is None or result.submap != 0 or result.status != "tracked":
             return
@@ -156,8 +152,6 @@ class ChangeWatch(RunObserver):
     def _looked_at(
         self, points: NDArray[np.float64], depth: NDArray[np.float32], T: NDArray[np.float64]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows of the points (n, 3) that a depth image looks through (the pixel and its neighbours see a surface
-        behind), and on its surface."""
         assert self._slam is not None
         camera, local = self._slam.camera, transformed(se3.inverse(T), points)
         ahead = (local[:, 2] > 0.3) & (local[:, 2] < self.volume.depth_max)
@@ -211,7 +205,6 @@ class ChangeWatch(RunObserver):
             observer.event("change", **row)
 
     def _is_known(self, kind: str, box: NDArray[np.float64]) -> bool:
-        """Whether a box touches a reported change of its kind, as more of one thing coming into view."""
         boxes = [np.array(row["box"]) for row in self.reported if row["kind"] == kind]
         return any(np.all((box[0] < b[1] + 2 * CELL) & (b[0] - 2 * CELL < box[1])) for b in boxes)
 

@@ -1,4 +1,4 @@
-"""Changes between two visits to a place: things that appeared, disappeared, moved, or got other colours."""
+"""Changes between two visits: things that appeared, disappeared, moved, or got other colours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,9 +28,9 @@ from dudmap.io.exporting.gravity import Floor, fitted, floor_height, level_norma
 
 Array = NDArray[np.float64]
 ON_SURFACE = 0.02
-"""Gap to a change, metres, within which other colours are its residue at the border."""
+"""Gap to a change, metres, of its residue in other colours."""
 LEAST_UNKNOWN = 0.25
-"""Smallest surface seen by only one visit that is listed, square metres."""
+"""Smallest listed surface of only one visit, square metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class Change:
     """A changed thing, in the frame of the earlier visit.
 
     Attributes:
-        kind: appeared, disappeared, moved, recoloured, or unknown (surface that only one visit saw).
-        before, after: Its surface in either visit, None if it is absent.
-        confidence: 0..1, share of its surface that agrees with its kind.
+        kind: appeared, disappeared, moved, recoloured, or unknown (only one visit saw it).
+        before, after: Surface in either visit, or None.
+        confidence: 0..1, share of surface that agrees with the kind.
     """
 
     kind: str
@@ -51,7 +51,7 @@ class Change:
 
     @property
     def points(self) -> Array:
-        """Present surface (n, 3), or the former surface of a thing that is gone, metres."""
+        """Present or former surface (n, 3), metres."""
         piece = self.after if self.after is not None else self.before
         assert piece is not None
         return piece.points
@@ -85,10 +85,8 @@ class Change:
 
 
 def find_changes(before: Visit, after: Visit, min_size: float = 0.1) -> tuple[list[Change], tuple[Evidence, Evidence]]:
-    """Find all changes of at least ``min_size`` (m), the largest first, then unknown surface.
-
-    Also returns the evidence of both visits.
-    """
+    """All changes of at least ``min_size`` (m), largest first, then unknown surface, and the evidence of both
+    visits."""
     found = evidence(before, after), evidence(after, before)
     voxel = max(before.volume.voxel_size, after.volume.voxel_size)
     missing, new = (denied_pieces(one, voxel, min_size) for one in found)
@@ -157,7 +155,7 @@ def _moved(
 
 
 def vertical(visit: Visit) -> Array:
-    """Vertical unit vector (3,): from level surfaces of a visit, else from how the camera was held."""
+    """Vertical unit vector (3,): of level surfaces, else of the held camera."""
     held = -visit.keyframes[:, :3, 1].mean(axis=0)
     held /= np.linalg.norm(held)
     some = visit.mesh.faces[:: max(1, len(visit.mesh.faces) // 20_000)]
@@ -168,7 +166,6 @@ def vertical(visit: Visit) -> Array:
 
 
 def _after_motion(piece: Piece, found: Evidence, there: Visit, T: Array, tree: KDTree) -> tuple[float, float]:
-    """Shares of a piece that a motion (4, 4) brings onto the other surface, and into free space."""
     points, limit = transformed(T, piece.points), float(np.median(found.tolerance[piece.vertices]))
     on, samples = tree.query(points)[0] < limit, there.sample(points)
     return float(on.mean()), float((~on & samples.is_free(limit)).mean())
@@ -188,7 +185,7 @@ def _unknown(found: Sequence[Evidence], voxel: float) -> list[Change]:
 
 
 def mesh_of(change: Change, found: tuple[Evidence, Evidence]) -> Mesh:
-    """Present surface of a change, or the former surface of a thing that is gone."""
+    """Present or former surface of a change."""
     one, piece = (found[1], change.after) if change.after is not None else (found[0], change.before)
     assert piece is not None
     chosen = np.zeros(len(one.state), bool)

@@ -22,7 +22,7 @@ from dudmap.own_folder import make_folder, remove_files
 
 CHANGES_FILE, REPORT = "changes.json", "report.html"
 WRITTEN = {"": r"changes\.json|report\.html", "changes": r"\d+\.ply"}
-"""Regular expressions of all file names of a comparison, by sub-folder."""
+"""File names of a comparison by sub-folder, regular expressions."""
 BEST_FRAMES = 3
 
 
@@ -33,11 +33,11 @@ def diff_runs(
 
     Args:
         before, after: Run folders with map.npz and keyframes.npz.
-        out: New folder, or one of an earlier comparison, for changes.json, changes/<id>.ply and report.html.
-        min_size: Edge of the smallest thing that is reported, metres.
+        out: New folder, or of an earlier comparison, for changes.json, changes/<id>.ply and report.html.
+        min_size: Smallest reported thing, metres.
 
     Raises:
-        MapError: A folder is no complete run folder, a map has no free space, or the places cannot be joined.
+        MapError: An incomplete run folder, a map without free space, or places that cannot be joined.
         ConfigError: ``min_size`` is out of range.
         DudmapError: ``out`` cannot be used.
     """
@@ -53,7 +53,7 @@ class Comparison:
     """Comparison of two runs.
 
     Attributes:
-        visits: The maps in the world of the first.
+        visits: The maps in the first one's world.
     """
 
     maps: tuple[SavedMap, SavedMap]
@@ -109,7 +109,6 @@ def compared(before: str | Path, after: str | Path, min_size: float) -> Comparis
 
 
 def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], NDArray[np.float64]]:
-    """Metrics of the alignment; pose (4, 4) of the second map in the first."""
     if same:
         return {"reason": None}, np.eye(4)
     pair = compare_maps(maps[0], maps[1], changed=True)
@@ -123,7 +122,7 @@ def _aligned(maps: Sequence[SavedMap], *, same: bool) -> tuple[dict[str, Any], N
 
 
 def best_frames(change: Change, saved: SavedMap, visit: Visit) -> list[tuple[float, NDArray[np.float64]]]:
-    """Times and poses (4, 4), in the common frame, of the keyframes that show a change largest and most central."""
+    """Times and poses (4, 4), common frame, of the keyframes that show a change best."""
     camera, box = visit.volume.camera, change.box
     centre, radius = box.mean(axis=0), np.linalg.norm(box[1] - box[0]) / 2
     scores = []

@@ -1,11 +1,11 @@
-"""Fuse many maps on disk, one range of space at a time, and write the surface as 3D Tiles 1.1 (OGC 22-025r4).
+"""Fuse many maps on disk, by ranges of space, and write the surface as 3D Tiles 1.1 (OGC 22-025r4).
 
-The world is cut into cells of 16x16x16 blocks, nodes of an octree with consecutive Morton codes. A range is a sequence
-of cells with about ``RANGE_BLOCKS`` blocks. A worker adds the maps that reach it, and writes a map file and the surface
-of every cell as a tile. Touching blocks of other ranges are fused for the border triangles only.
+Cells of 16x16x16 blocks are nodes of an octree with consecutive Morton codes. A range is a sequence of cells with about
+``RANGE_BLOCKS`` blocks; a worker adds its maps, and writes a map file and a tile per cell. Touching blocks of other
+ranges are fused for border triangles.
 
-Leaves are cells with their full surface. An inner tile joins the vertices of its children in cubes of twice the size,
-so that all have about as many triangles (refinement REPLACE).
+Leaves have the full surface; an inner tile clusters its children's vertices in cubes of twice the size (refinement
+REPLACE).
 """
 
 import json
@@ -29,14 +29,13 @@ from dudmap.io.exporting.mesh_files import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""Rotation of tiles from map axes (x right, y down) to glTF (y up). It undoes the turn by readers of 3D Tiles, and
-turns the z-up tileset."""
+"""Rotation of tiles from map axes (x right, y down) to glTF (y up), against the readers' turn."""
 BITS_PER_LEVEL = 3
 
 CELL_BITS = 12
-"""Bits of a block's code within its cell: cells are 16 blocks wide, 2.56 m with voxels of 2 cm."""
+"""Bits of a block's code within its cell, 16 blocks wide."""
 RANGE_BLOCKS = 6000
-"""Blocks with voxels per range: 110 MB of sums, and half as many again for the surrounding blocks."""
+"""Blocks with voxels per range: 110 MB of sums, and half for the surroundings."""
 MAP_FOLDER = "map"
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
@@ -46,8 +45,8 @@ class Tile:
     """A written tile.
 
     Attributes:
-        height: Levels below it, 0 for a leaf.
-        low, high: (3,) corners of its surface, metres, world frame.
+        height: Levels below, 0 for a leaf.
+        low, high: (3,) corners, metres, world frame.
     """
 
     name: str
@@ -59,7 +58,7 @@ class Tile:
 
 
 def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()) -> Tile:
-    """Write the GLB file of a tile, and its mesh for the parent tile."""
+    """Write a tile's GLB file, and its mesh for the parent."""
     write_bytes(out / TILE_FOLDER / f"{name}.glb", encoded(mesh, T_GLTF_MAP))
     mesh.save(work / f"{name}.ply")
     low, high = mesh.vertices.min(axis=0).astype(np.float64), mesh.vertices.max(axis=0).astype(np.float64)
@@ -69,8 +68,7 @@ def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, childr
 
 
 def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path, workers: Workers) -> Tile:
-    """Write all inner tiles above the leaves and return the root. Names of leaves are the hexadecimal codes of their
-    cells."""
+    """Write inner tiles above leaves, named by hexadecimal codes; return the root."""
     done = {leaf.name: leaf for leaf in leaves}
     inner = _inner_nodes(sorted(int(leaf.name, 16) for leaf in leaves))
     for height in sorted({height for height, _, _ in inner}):
@@ -81,8 +79,7 @@ def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path,
 
 
 def error_of(height: int, voxel_size: float) -> float:
-    """Geometric error of a tile, metres. One level moves a vertex by less than the diagonal of its cube, ``sqrt(3) s
-    2^h``; all levels below together by less than this again."""
+    """Geometric error of a tile, metres: below twice the diagonal ``sqrt(3) s 2^h`` of its cubes."""
     return 0.0 if height == 0 else 2 * np.sqrt(3) * voxel_size * 2**height
 
 
@@ -109,8 +106,6 @@ def _tile_tree(tile: Tile, voxel_size: float) -> dict[str, Any]:
 
 
 def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
-    """Inner nodes of the octree as (height, name, names of the children), children first; single children are
-    skipped."""
     out: list[tuple[int, str, list[str]]] = []
 
     def node(part: list[int]) -> tuple[int, str]:
@@ -143,7 +138,7 @@ def _write_parent(voxel_size: float, out: Path, work: Path, parent: tuple[str, t
 
 @dataclass(frozen=True, eq=False)
 class PlacedRun:
-    """A run folder and the pose (4, 4) of its world in the common world."""
+    """A run folder and its pose (4, 4) in the common world."""
 
     folder: Path
     T_world_run: NDArray[np.float64]
@@ -151,7 +146,7 @@ class PlacedRun:
 
 @dataclass(frozen=True)
 class CellRange:
-    """Cells with codes from ``first`` to ``last``, and the runs that reach them or a neighbouring cell."""
+    """Cells from ``first`` to ``last``, and the runs that reach them or neighbours."""
 
     first: int
     last: int
@@ -159,7 +154,7 @@ class CellRange:
 
 
 def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RANGE_BLOCKS) -> list[CellRange]:
-    """Cut the world into ranges of at most ``limit`` blocks with voxels, or single cells."""
+    """Cut the world into ranges of at most ``limit`` blocks, or single cells."""
     blocks: dict[int, int] = {}
     reached: dict[int, set[int]] = {}
     for number, (near, counts, cells) in enumerate(workers.map(_occupied_cells, runs)):
@@ -185,10 +180,8 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
 
 
 def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tuple[dict[str, Any], list[Tile]]:
-    """Fuse a range with the parameters of ``like``; write its map file and the tiles of its cells.
-
-    Meshes for inner tiles go into ``work``. Returns the range's entry of world.json and the tiles.
-    """
+    """Fuse a range with the parameters of ``like``; write its map file, tiles, and meshes for inner tiles (``work``).
+    Returns its entry of world.json, and the tiles."""
     empty_map = like.volume()
     low, high = cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS
     reached = [reached_blocks(run.folder, run.T_world_run.tobytes()) for run in cells.runs]
@@ -235,14 +228,13 @@ def _write_tiles(cells: CellRange, fused: FusedRange, like: TsdfVolume, out: Pat
 
 
 def _occupied_cells(run: PlacedRun) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Cells that the voxels of a run reach, blocks in each, and all cells that the run reaches."""
     reached = reached_blocks(run.folder, run.T_world_run.tobytes())
     near, counts = np.unique(reached.near >> CELL_BITS, return_counts=True)
     return near, counts, np.union1d(near, reached.empty >> CELL_BITS)
 
 
 def _with_neighbours(codes: NDArray[np.int64], level: int) -> NDArray[np.int64]:
-    """Codes (n, 27) of each cube of ``2^level`` blocks with code (n,) and of its neighbours."""
+    """Codes (n, 27) of cubes of ``2^level`` blocks and their neighbours."""
     coords = morton.decode(codes << (3 * level)) >> level
     return morton.encode((coords[:, None] + _AROUND) << level) >> (3 * level)
 

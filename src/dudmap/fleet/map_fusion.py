@@ -1,7 +1,7 @@
-"""Fuse maps with known relative poses, one range of blocks (Morton codes) at a time, by exact integer sums.
+"""Fuse maps with known poses, by ranges of blocks (Morton codes) and exact integer sums.
 
-The running average of a voxel (thesis eq. 4.18-4.23) is a weighted mean, so that of several maps is ``sdf = sum(w_i
-sdf_i) / sum(w_i)``, rounded once. Integer sums make it independent of the order of the maps.
+The running average (thesis eq. 4.18-4.23) of several maps is ``sdf = sum(w_i sdf_i) / sum(w_i)``, independent of their
+order.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,16 +20,16 @@ from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
 
 VOXELS = BLOCK**3
 MAX_COUNT = 255
-"""Largest weight of a voxel and number of observations of emptiness of a block."""
+"""Largest weight of a voxel and emptiness count of a block."""
 MAX_STEPS = 32767
-"""Largest distance of a voxel, steps. Maps with larger steps (a wider truncation band) may exceed it."""
+"""Largest distance of a voxel, steps; wider truncation bands may exceed it."""
 _LOCAL = np.stack(np.unravel_index(np.arange(VOXELS), (BLOCK, BLOCK, BLOCK)), axis=1).astype(np.float64)
 PROBES = np.stack(np.meshgrid(*[np.array([0.0, 3.5, 7.0])] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 """Points (27, 3) of a block, in voxels."""
 RANGE_BLOCKS = 4096
-"""Blocks with voxels per range of ``fuse_maps``: 75 MB of sums."""
+"""Blocks per range of ``fuse_maps``: 75 MB of sums."""
 BATCH = 512
-"""Blocks of a map that are sampled at a time: about 50 MB of samples."""
+"""Blocks sampled at a time: 50 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +38,9 @@ class FusedRange:
 
     Attributes:
         codes: (n,) int64 Morton codes.
-        has_voxels: (n,) bool; the other blocks are known to be empty.
+        has_voxels: (n,) bool; others are empty.
         free_count: (n,) uint8 observations of emptiness.
-        geometry, colors: (m, 512) int32 packed voxels of the blocks with voxels, in the same order.
+        geometry, colors: (m, 512) int32 packed voxels, in the same order.
     """
 
     codes: NDArray[np.int64]
@@ -76,11 +76,11 @@ class BlockSums:
     """Sums of n blocks over maps.
 
     Attributes:
-        coords: (n, 3) int32 coordinates of the blocks.
-        weight, distance: (n, 512) int64, sum of the weights, and of weight times distance in steps.
-        shade_weight, shade: (n, 512) int64, the same of the intensities 1..255.
-        color_weight, color: (n, 512) and (n, 512, 3) int64, the same of the colours in quarters of a grey level.
-        free: (n,) int64, observations of emptiness by maps in which the block has no voxels.
+        coords: (n, 3) int32.
+        weight, distance: (n, 512) int64 sums of weights, and of weight times distance in steps.
+        shade_weight, shade: (n, 512) int64, of intensities 1..255.
+        color_weight, color: (n, 512) and (n, 512, 3) int64, of colours in quarters of a grey level.
+        free: (n,) int64, observations of emptiness by maps without voxels there.
     """
 
     coords: NDArray[np.int32]
@@ -113,10 +113,10 @@ class BlockSums:
 def block_sums(
     volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None, sdf_unit: float
 ) -> BlockSums:
-    """Sums of one map at blocks (n, 3) of a grid with voxels of the same size.
+    """Sums of one map at blocks (n, 3) of a grid of equal voxels.
 
-    ``sdf_unit`` is the step of the distances, metres. ``T_volume_grid`` (4, 4) maps the world of the grid to the world
-    of the map, which is interpolated trilinearly. With None, both grids are equal and the voxels are copied.
+    ``sdf_unit``: step of distances, metres. ``T_volume_grid`` (4, 4): grid to map world, interpolated trilinearly; None
+    copies equal grids.
     """
     if T_volume_grid is None:
         return _exact_sums(volume, coords)
@@ -134,8 +134,8 @@ def block_sums(
 def empty_counts(
     volume: TsdfVolume, coords: NDArray[np.int32], T_volume_grid: NDArray[np.float64] | None
 ) -> NDArray[np.int64]:
-    """Observations of emptiness (n,) of blocks (n, 3) of a grid in which no map has voxels; see ``block_sums``. On
-    another grid all ``PROBES`` of a block must be empty."""
+    """Observations of emptiness (n,) of blocks (n, 3) without voxels; all ``PROBES`` must be empty; see
+    ``block_sums``."""
     if T_volume_grid is None:
         entries = hashing.find_all(volume.blocks.table, volume.blocks.coords, coords)
         return np.where(entries >= 0, volume.blocks.free_count[np.maximum(entries, 0)], 0).astype(np.int64)
@@ -165,7 +165,6 @@ def _samples(
 
 
 def _least_emptiness(volume: TsdfVolume, rows: NDArray[np.float32], states: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Smallest count of emptiness (n,) of blocks if all points (n, k) lie in empty blocks; else 0."""
     empty = np.all(states == EMPTY, axis=1)
     least = np.rint(rows[..., WEIGHT].min(axis=1) / volume.config.carve_rate)
     return np.where(empty, least, 0).astype(np.int64)
@@ -179,7 +178,6 @@ def _sums(
     color: NDArray[np.int32],
     free: NDArray[np.int64],
 ) -> BlockSums:
-    """Sums of one map from its values; an intensity or colour of 0 is unknown."""
     wide = weight.astype(np.int64)
     shade_weight = wide * (shade > 0)
     color_weight = wide * np.any(color > 0, axis=-1)
@@ -192,9 +190,8 @@ def _sums(
 def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
     """Divide the sums.
 
-    Emptiness in one map where another has voxels counts as an observation at ``free_steps`` (truncation in steps) with
-    weight ``carve_rate``. Objects that left thus disappear. A block that is then empty everywhere, by ``free_after``
-    observations, loses its voxels.
+    Emptiness in one map against voxels of another counts as an observation at ``free_steps`` (truncation) of weight
+    ``carve_rate``: objects that left disappear. Blocks then empty, by ``free_after`` observations, lose their voxels.
     """
     held = np.any(sums.weight > 0, axis=1)
     emptiness = (carve_rate * sums.free * held)[:, None]
@@ -220,7 +217,6 @@ def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) ->
 
 
 def _rounded(total: NDArray, weight: NDArray) -> NDArray:
-    """``total / weight`` to the nearest whole number, halves up; 0 without weight."""
     weight = np.broadcast_to(weight, total.shape)
     divisor = np.where(weight > 0, weight, 1)
     return np.where(weight > 0, (2 * total + divisor) // (2 * divisor), 0)
@@ -228,8 +224,8 @@ def _rounded(total: NDArray, weight: NDArray) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class ReachedBlocks:
-    """Blocks of the result that a map contributes to, as ascending Morton codes: ``near`` (n,) by voxels, ``empty``
-    (m,) by blocks without voxels. A block can be in both."""
+    """Blocks that a map contributes to, ascending Morton codes: ``near`` (n,) by voxels, ``empty`` (m,) without;
+    perhaps both."""
 
     near: NDArray[np.int64]
     empty: NDArray[np.int64]
@@ -238,7 +234,7 @@ class ReachedBlocks:
     def of(
         cls, coords: NDArray[np.integer], has_voxels: NDArray[np.bool_], T: NDArray[np.float64], block_size: float
     ) -> "ReachedBlocks":
-        """Blocks reached by the points ``PROBES`` of blocks (n, 3) of a map at the pose ``T`` (4, 4)."""
+        """Blocks reached by ``PROBES`` of blocks (n, 3) of a map at ``T`` (4, 4)."""
         codes = morton.encode(coords)[:, None]
         if not np.array_equal(T, np.eye(4)):
             points = coords[:, None].astype(np.float64) + PROBES / BLOCK
@@ -256,11 +252,10 @@ def fused_blocks(
     like: TsdfVolume,
     maps: Iterable[tuple[TsdfVolume, NDArray[np.float64], ReachedBlocks]],
 ) -> FusedRange:
-    """Fuse maps, in any order, into some blocks given by Morton codes.
+    """Fuse maps, in any order, into blocks ``near`` (n,) and ``empty`` (m,), Morton codes, with the parameters of
+    ``like``.
 
-    Voxels of a map reach the blocks ``near`` (n,); ``empty`` (m,) are empty in a map. The result has the camera and
-    parameters of ``like``. The ``maps`` come with their poses (4, 4): on the same grid they are copied exactly,
-    otherwise interpolated trilinearly.
+    ``maps`` have poses (4, 4): equal grids are copied, others interpolated trilinearly.
     """
     sums, free = BlockSums.zeros(morton.decode(near)), np.zeros(len(empty), np.int64)
     for volume, T, reached in maps:
@@ -283,8 +278,7 @@ def fused_blocks(
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
-    """Fuse maps with voxels of one size, at their poses (4, 4), on the grid and with the parameters of the first.
-    Identity poses are copied exactly, others interpolated."""
+    """Fuse maps of one voxel size at their poses (4, 4) on the grid of the first; identity poses are copied exactly."""
     reached = [
         ReachedBlocks.of(one.coords[:n], one.slot_of[:n] >= 0, T, volumes[0].block_size)
         for one, n, T in ((v.blocks, v.blocks.num_entries, T) for v, T in zip(volumes, Ts_world_volume, strict=True))

@@ -1,4 +1,4 @@
-"""Merge two saved maps: relative pose by votes of keyframes, refinement, checks, fusion."""
+"""Merge two saved maps: votes of keyframes, refinement, checks, fusion."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -25,22 +25,20 @@ from dudmap.fleet.map_samples import SurfacePoints, surface_points
 from dudmap.fleet.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
 
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.1, 4.0
-"""Keyframe pairs vote for one relative pose within this distance (m, deg) of either camera; a pair is accurate to
-centimetres and a degree."""
+"""Keyframe pairs within this distance (m, deg) vote for one pose."""
 MAX_HYPOTHESES = 5
 
 SURFACE_POINTS = 20_000
 MIN_KEYFRAMES, MIN_FEATURES = 2, 40
-"""Keyframes that must be recognised at one relative pose; a single one needs this many features. Look-alike places
-reach 200."""
+"""Keyframes recognised at one pose; a single one needs this many features, because look-alike places reach 200."""
 NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Relative pose ``T_a_b`` (4, 4), world of b to world of a, on which keyframe pairs agree.
+    """Relative pose ``T_a_b`` (4, 4), world of b to a, of agreeing keyframe pairs.
 
-    ``num_keyframes`` counts the keyframes of b recognised at it, ``num_inliers`` the matching features of all pairs.
+    ``num_keyframes``: recognised of b; ``num_inliers``: features of all pairs.
     """
 
     T_a_b: NDArray[np.float64]
@@ -51,11 +49,8 @@ class Hypothesis:
 def relative_poses(
     a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
 ) -> list[Hypothesis]:
-    """Relative poses ``T_a_b`` of two maps from their keyframes, best first; empty if no keyframe of b is recognised in
-    a.
-
-    Matches (``KeyframeDatabase.match``, with the ``camera`` of a) that agree are averaged, weighted by their features.
-    """
+    """Relative poses ``T_a_b`` from keyframes, best first: averages of agreeing matches (``KeyframeDatabase.match``,
+    ``camera`` of a)."""
     database = KeyframeDatabase(RelocalizationConfig(), camera, sensor)
     votes: list[tuple[int, NDArray[np.float64], NDArray[np.float64], int]] = []
     for number, keyframe in enumerate(b):
@@ -79,7 +74,7 @@ def _agreeing(vote: tuple, votes: list[tuple]) -> list[tuple]:
 
 
 def _average(votes: list[tuple]) -> NDArray[np.float64]:
-    """Weighted mean of relative poses at the camera positions, to avoid a lever arm."""
+    """Weighted mean of relative poses at the camera positions."""
     weights = np.array([vote[3] for vote in votes], float)
     Ts, cameras = np.stack([vote[1] for vote in votes]), np.stack([vote[2] for vote in votes])
     T = np.eye(4)
@@ -94,9 +89,9 @@ class MapPair:
     """Result of comparing two maps.
 
     Attributes:
-        T_a_b: (4, 4) world of b to world of a, None if the maps are not to be merged.
-        reason: Why not, one sentence; empty if they are merged.
-        hypothesis, alignment, agreement: Of the accepted relative pose, or of the first one tried.
+        T_a_b: (4, 4) world of b to a, None if not to be merged.
+        reason: Why not; empty if merged.
+        hypothesis, alignment, agreement: Of the accepted pose, or the first tried.
     """
 
     T_a_b: NDArray[np.float64] | None
@@ -107,10 +102,7 @@ class MapPair:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the surfaces coincide in different colours, as in two similar places.
-
-        Disagreement of free space does not count: a person who stayed, or a bent map, also causes it.
-        """
+        """Whether surfaces coincide in other colours, as in similar places."""
         found = self.agreement
         return self.T_a_b is None and found is not None and found.enough and bool(found.color_reason(many=True))
 
@@ -130,7 +122,7 @@ class MapPair:
 
 @dataclass(frozen=True, eq=False)
 class MapSurface:
-    """A map with surface points for comparison with others."""
+    """A map with surface points."""
 
     volume: TsdfVolume
     points: SurfacePoints
@@ -147,9 +139,9 @@ class MapSurface:
 
 
 def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
-    """Find the relative pose of two maps and decide whether they show the same place.
+    """Relative pose of two maps, and whether they show one place.
 
-    ``changed``: The maps are two visits between which things may have moved.
+    ``changed``: two visits with changes.
 
     Raises:
         MapError: A map has no surface.
@@ -161,7 +153,6 @@ def compare_maps(a: SavedMap, b: SavedMap, changed: bool = False) -> MapPair:
 
 
 def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
-    """Relative poses at which enough keyframes of b are recognised in a."""
     found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
     return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
@@ -169,8 +160,8 @@ def _recognised(a: SavedMap, b: SavedMap) -> list[Hypothesis]:
 def decided(
     a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False, changed: bool = False
 ) -> MapPair:
-    """Refine and check relative poses in order; return the first that passes all checks, else the rejection of the
-    first. ``many``: most pairs of a large set show different places."""
+    """Refine and check poses in order; return the first that passes, else the first rejection. ``many``: most pairs
+    show different places."""
     empty = [name for name, one in (("first", a), ("second", b)) if not len(one.points)]
     if empty:
         return MapPair(None, f"the {' and the '.join(empty)} has no surface, its mesh is empty; leave that run out")
@@ -201,6 +192,6 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool, c
 
 
 def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap:
-    """Fuse two maps into one in the world of a, with the keyframes of both."""
+    """Fuse two maps in the world of a, with all keyframes."""
     moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)

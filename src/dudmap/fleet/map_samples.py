@@ -1,4 +1,4 @@
-"""Sample a map at points of its world: distance, intensity, colour, and state."""
+"""Sample a map at points of its world."""
 
 from dataclasses import dataclass
 
@@ -12,11 +12,9 @@ from dudmap.core.map.volume import TsdfVolume
 __all__ = ["EMPTY", "OBSERVED", "UNSEEN", "MapSamples", "SurfacePoints", "sample_map", "surface_points"]
 
 IN_BAND = 0.9
-"""Share of the truncation distance beyond which a voxel is free space (``SURFACE_SHARE`` in
-``core/formulas/voxel.py``)."""
+"""Share of the truncation beyond which a voxel is free space (``SURFACE_SHARE`` in ``core/formulas/voxel.py``)."""
 NOISE_IN_BAND = 2.0
-"""Standard deviations of depth noise that must fit into the truncation distance for free space to contradict a
-surface."""
+"""Standard deviations of noise within the truncation for free space to contradict a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +22,10 @@ class MapSamples:
     """A map at n points.
 
     Attributes:
-        state: (n,) uint8, UNSEEN, OBSERVED, or EMPTY in a block of free space.
-        sdf: (n,) float32, distance to the surface, metres; the truncation distance in free space.
+        state: (n,) uint8, UNSEEN, OBSERVED, or EMPTY.
+        sdf: (n,) float32, metres; the truncation distance in free space.
         sdf_gradient: (n, 3) float32, metres per metre.
-        weight: (n,) float32, smallest weight of the voxels around the point.
+        weight: (n,) float32, smallest around the point.
         intensity: (n,) float32, 0..1; 0 = unknown.
         intensity_gradient: (n, 3) float32, per metre.
         color: (n, 3) float32, red green blue, 0..255; 0 = unknown.
@@ -42,7 +40,7 @@ class MapSamples:
     color: NDArray[np.float32]
 
     def is_free(self, distance: float | NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether each point (n,) lies in observed free space, farther than ``distance`` (n,) (m) from surface."""
+        """Whether points (n,) lie in free space, farther than ``distance`` (n,) (m) from surface."""
         return (self.state == EMPTY) | ((self.state == OBSERVED) & (self.sdf > distance))
 
 
@@ -71,10 +69,10 @@ class SurfacePoints:
     """Points on the surface of a map.
 
     Attributes:
-        points: (n, 3) float64, metres, world frame of the map.
+        points: (n, 3) float64, metres, map world.
         intensity: (n,) float32, 0..1, 0 = unknown.
         color: (n, 3) float32, red green blue, 0..255.
-        near: (n,) bool, whether a camera was near enough for its noise to fit into the truncation band.
+        near: (n,) bool, whether a camera was near enough for its noise to fit into the band.
     """
 
     points: NDArray[np.float64]
@@ -88,9 +86,9 @@ class SurfacePoints:
 
 
 def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int) -> SurfacePoints:
-    """At most ``count`` random vertices of a map's mesh, about evenly spread over its surface.
+    """At most ``count`` random vertices of a map's mesh, evenly spread.
 
-    ``cameras`` (k, 3) are the positions of its keyframes, metres.
+    ``cameras`` (k, 3): of its keyframes, metres.
 
     Raises:
         MapError: The map is empty.

@@ -1,4 +1,4 @@
-"""Merge run folders: two maps of one place into a run folder, many into worlds of map parts and tiles."""
+"""Merge run folders: two maps into a run folder, many into worlds of parts and tiles."""
 
 import json
 import logging
@@ -51,17 +51,17 @@ WRITTEN = {
     "": rf"{re.escape(WORLD_FILE)}|{re.escape(TILESET_FILE)}|trajectory(-\d+)?\.txt",
     MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
 }  # fmt: skip
-"""Regular expressions of all file names of a world, by sub-folder."""
+"""File names of a world by sub-folder, regular expressions."""
 
 
 def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
-    """Merge the maps of two run folders into a new run folder, in the world frame of the first; return merge.json.
+    """Merge two run folders into a new one, in the first world; return merge.json. Nothing is written if they do not
+    match.
 
-    The folder holds map, keyframes, mesh, metrics.json, merge.json, the first config.toml, and both trajectories. If
-    the maps do not match, nothing is written.
+    It holds map, keyframes, mesh, metrics.json, merge.json, the first config.toml, and both trajectories.
 
     Raises:
-        MapError: The maps do not match; the message says why.
+        MapError: The maps do not match; it says why.
         DudmapError: As in ``check_runs``, or ``out`` cannot be written.
     """
     a, b, out = Path(a), Path(b), Path(out)
@@ -95,12 +95,10 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
 
 
 def save_trajectories(out: Path, runs: Sequence[tuple[Path, NDArray[np.float64]]]) -> list[list[str]]:
-    """Write trajectories as trajectory.txt, trajectory-2.txt, ..., transformed by the poses (4, 4) of their worlds.
-
-    Returns the file names per run; a merged run has several.
+    """Write trajectory.txt, trajectory-2.txt, ..., moved by poses (4, 4) of their worlds; returns file names per run.
 
     Raises:
-        DatasetError: A trajectory, or the list of trajectories in merge.json, is damaged.
+        DatasetError: A trajectory, or their list in merge.json, is damaged.
     """
     names: list[list[str]] = []
     for folder, T in runs:
@@ -123,8 +121,8 @@ class FleetReport:
     """Result of a merge of many runs.
 
     Attributes:
-        out: Folder of the largest world; it holds the others as part-2, part-3, ...
-        sentences: Messages for the user: runs that were not joined, joins that contradict others.
+        out: Folder of the largest world, with the others as part-2, part-3, ...
+        sentences: Runs not joined, contradictory joins.
     """
 
     out: Path
@@ -133,17 +131,15 @@ class FleetReport:
 
 
 def merge_fleet(runs: Sequence[str | Path], out: str | Path, *, workers: int = 1) -> FleetReport:
-    """Merge the maps of two or more runs.
+    """Merge the maps of two or more runs into a new folder, or over a world.
 
-    The folder must be new, or hold a world, which is replaced. It receives world.json, map/<code>.npz per range
-    (``TsdfVolume.load``), tileset.json and tiles/ (3D Tiles 1.1), and trajectory.txt, trajectory-2.txt, ... in the
-    world of the first run. Other groups of at least two runs become worlds in part-2, part-3, ... ``workers`` is the
-    number of processes.
+    Writes world.json, map/<code>.npz per range (``TsdfVolume.load``), tileset.json and tiles/ (3D Tiles 1.1), and
+    trajectory.txt, trajectory-2.txt, ... in the first run's world. Other groups of runs become worlds in part-2,
+    part-3, ... ``workers``: processes.
 
     Raises:
-        ConfigError: A run is named twice, or the voxels differ in size.
-        MapError: A run folder is incomplete, or no two runs can be joined.
-        DudmapError: ``out`` cannot be used.
+        ConfigError: A run is named twice, or voxels differ in size.
+        MapError: An incomplete run folder, or no two runs can be joined.
     """
     folders, out = [Path(run) for run in runs], Path(out)
     like = check_runs(folders, out)
@@ -203,7 +199,6 @@ def _write_world(
 
 
 def _check_out(out: Path) -> None:
-    """Remove the world that a folder holds; a ``DudmapError`` if it holds anything else."""
     try:
         if out.exists() and any(out.iterdir()):
             if not (out / WORLD_FILE).is_file():
@@ -220,7 +215,7 @@ def _check_out(out: Path) -> None:
 
 
 def _load_kernels(like: MapHeader) -> None:
-    """Compile kernels before the workers start: two processes must not write one cache."""
+    """Compile kernels before the workers, which must not write one cache."""
     words = np.full((1, VOXELS), MAX_COUNT << 8, np.int32)
     block = FusedRange(morton.encode(np.zeros((1, 3), np.int64)), np.ones(1, bool), np.zeros(1, np.uint8), words, words)
     volume = block.volume(like.volume())

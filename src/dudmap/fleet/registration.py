@@ -1,9 +1,8 @@
-"""Relative poses of runs, in rounds: similar runs first, then runs that overlap at the poses found so far.
+"""Relative poses of runs: similar runs first, then runs that overlap.
 
-Places are recognised by VLAD (Jegou et al. 2010). The differences of a keyframe's features to their nearest visual
-words are summed per word. They are normalised per word (Arandjelovic and Zisserman 2013) and as a whole. The words are
-k-means centres of features of all runs. Whitening (Jegou and Chum 2012) scales the principal components, because many
-places share doors and wallpaper.
+Places are recognised by VLAD (Jegou et al. 2010): differences of features to their nearest visual words (k-means),
+summed and normalised per word (Arandjelovic and Zisserman 2013). Whitening (Jegou and Chum 2012), because many places
+share doors and wallpaper.
 """
 
 import logging
@@ -29,29 +28,29 @@ from dudmap.fleet.workers import MapHeader, Workers, keyframes_of, surface_of
 log = logging.getLogger(__name__)
 
 WORDS = 16
-"""Visual words; a descriptor then has 2048 numbers, 8 KB."""
+"""Visual words: descriptors of 2048 numbers."""
 TRAINING = 50_000
-"""Most features that train the words: 3000 per word."""
+"""Features that train the words."""
 COMPONENTS, WHITENING = 256, 0.25
-"""Principal components kept, and the exponent of their variances in the whitening; 0.5 would amplify noise."""
+"""Kept principal components, and whitening exponent of their variances."""
 LEAST_VARIANCE = 1e-6
-"""Added to each variance because copies of one run have none."""
+"""Added to variances, which copies of a run lack."""
 NEIGHBOURS, LEAST_VOTE = 20, 1e-4
-"""Runs that a keyframe votes for, more if equally similar, and its vote for the last of them."""
+"""Runs that a keyframe votes for, and its vote for the last."""
 PARTNERS = 8
-"""Runs that each run is compared with; similar places compete with neighbours."""
+"""Runs that each is compared with."""
 
 ALL_PAIRS = PARTNERS
-"""Number of runs up to which all pairs are compared."""
+"""Runs up to which all pairs are compared."""
 Guesses = dict[tuple[int, int], NDArray[np.float64]]
 ROUNDS = 4
-"""Most rounds; the third and fourth are small."""
+"""Most rounds."""
 MIN_PREDICTED = 0.3
-"""Smallest predicted overlap for a comparison, share of the smaller map."""
+"""Smallest predicted overlap to compare, share of the smaller map."""
 CELL = 0.3
-"""Edge of the cells in which overlap is counted, metres: many times the error of a pose."""
+"""Cells of overlap, metres."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
-"""A rejection at one relative pose is not valid for poses that differ by more than this (m, deg)."""
+"""A rejection is not valid for poses that differ by more (m, deg)."""
 
 
 def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -75,8 +74,8 @@ def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDAr
 
 
 def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Similarity (n, n) of the places of runs from descriptors (k, d) of each. Every keyframe votes for the
-    ``NEIGHBOURS`` runs with the most similar keyframes, by its excess over the last of them."""
+    """Similarity (n, n) of runs from descriptors (k, d) of each. Every keyframe votes for the ``NEIGHBOURS`` most
+    similar runs, by its excess over the last."""
     everything = _whitened(np.concatenate(runs))
     sizes = np.array([len(run) for run in runs], np.int64)
     ends, held = np.cumsum(sizes), np.flatnonzero(sizes)
@@ -93,14 +92,14 @@ def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
 
 
 def most_similar(votes: NDArray[np.float32], partners: int) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b: each run with its ``partners`` most voted runs in ``votes`` (n, n)."""
+    """Pairs (a, b), a < b, of each run with its ``partners`` in ``votes`` (n, n)."""
     best = np.argsort(-votes, axis=1, kind="stable")[:, :partners]
     pairs = {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(best) for b in row if votes[a, b] > 0}
     return sorted(pairs)
 
 
 def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Whitened principal components (k, at most COMPONENTS and k / 2) of descriptors (k, d), unit length."""
+    """Whitened principal components, unit length."""
     count, size = descriptors.shape
     centred = (descriptors - descriptors.mean(axis=0)).astype(np.float64)
     wide = count < size  # decompose the smaller of both products; their nonzero eigenvalues are equal
@@ -117,7 +116,7 @@ Pairs = dict[tuple[int, int], MapPair]
 
 
 def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:
-    """Join of the accepted relative pose of two runs, if there is one."""
+    """Join of an accepted relative pose, or None."""
     T, alignment, agreement = pair.T_a_b, pair.alignment, pair.agreement
     if T is None or alignment is None or agreement is None:
         return None
@@ -125,7 +124,7 @@ def join_of(runs: tuple[int, int], pair: MapPair) -> Join | None:
 
 
 def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
-    """Similarity (n, n) of the places of the runs, see ``similarity``; 1 for few runs, of which all pairs are compared.
+    """Similarity (n, n) of runs, see ``similarity``; 1 for few.
 
     Raises:
         MapError: A keyframe file is damaged.
@@ -139,10 +138,7 @@ def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
 
 
 def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], workers: Workers, guesses: Guesses) -> Pairs:
-    """Compare pairs of runs; ``guesses`` are tried before the features.
-
-    Pairs with the same first run are one job, which reads that run once.
-    """
+    """Compare pairs of runs; ``guesses`` come before features. A job has the pairs of one first run."""
     groups: dict[int, list[int]] = {}
     for a, b in pairs:
         groups.setdefault(a, []).append(b)
@@ -187,10 +183,9 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
 
 
 def registered_runs(runs: Sequence[Path], workers: Workers) -> tuple[Pairs, RunGraph]:
-    """Relative poses of pairs of runs, and the poses of all runs.
+    """Relative poses of pairs, and poses of all runs.
 
-    The first round compares each run with its most similar runs. Further rounds compare the runs that overlap at the
-    current poses and smaller groups with the next similar runs.
+    Round one compares similar runs; later ones those that overlap, and smaller groups with the next similar.
 
     Raises:
         MapError: A file is damaged.
@@ -229,7 +224,6 @@ def _is_at(graph: RunGraph, pair: tuple[int, int], T: NDArray[np.float64]) -> bo
 def _brought_together(
     graph: RunGraph, blocks: Sequence[NDArray[np.float64]], found: Pairs, guesses: Guesses
 ) -> list[tuple[int, int]]:
-    """Joined runs that overlap and were not compared at their poses, largest overlaps first."""
     shares = np.zeros((len(blocks), len(blocks)), np.float32)
     for part in graph.components:
         shares[np.ix_(part, part)] = predicted_overlap([transformed(graph.Ts[run], blocks[run]) for run in part], CELL)
@@ -241,7 +235,7 @@ def _brought_together(
 
 
 def predicted_overlap(points: Sequence[NDArray[np.float64]], cell: float) -> NDArray[np.float32]:
-    """Common cells of two sets of points (k, 3) as a share (n, n) of the smaller set; 0 on the diagonal."""
+    """Common cells of point sets (k, 3) as shares (n, n) of the smaller set; 0 on the diagonal."""
     cells = [np.unique(morton.encode(np.floor(own / cell).astype(np.int64))) for own in points]
     sizes = np.array([len(own) for own in cells])
     _, columns = np.unique(np.concatenate(cells), return_inverse=True)
@@ -253,7 +247,6 @@ def predicted_overlap(points: Sequence[NDArray[np.float64]], cell: float) -> NDA
 
 
 def _more_partners(graph: RunGraph, similar: NDArray[np.float32], found: Pairs) -> list[tuple[int, int]]:
-    """Pairs of runs in different groups: each run of a smaller group with its next similar runs."""
     left = similar.copy()
     for a, b in found:
         left[a, b] = left[b, a] = 0

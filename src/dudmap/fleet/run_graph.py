@@ -1,7 +1,6 @@
-"""Poses of many runs from pairwise relative poses: rejection by cycles, then a robust pose graph (Huber).
+"""Poses of many runs from relative poses: rejection by cycles, then a robust pose graph (Huber).
 
-Relative poses around a cycle must compose to the identity. If not, its joins that no other cycle confirms are rejected:
-a false join costs more than a missed one.
+Relative poses around a cycle compose to the identity; else its joins without another confirming cycle are rejected.
 """
 
 from collections import deque
@@ -19,22 +18,22 @@ from dudmap.core.places.pose_graph import Edge, optimize
 Pair = tuple[int, int]
 
 SIGMA_DISTANCE, SIGMA_ANGLE = 0.01, np.radians(0.2)
-"""Standard deviation per axis of a relative pose of two runs, at the middle of their common surface (m, rad): drift
-within the runs."""
+"""Standard deviation per axis of a relative pose, at the middle of the common surface (m, rad): drift within runs."""
 HALF = 0.5
-"""Overlap at which these hold. Joins of rendered runs err by 4.4 mm above it, 4.9 mm at 35 to 50 %, 11.8 mm at 25 to
-35 %, 17 mm below."""
+"""Overlap of these values. Joins of rendered runs err by 4.4 mm above it, 4.9 mm at 35 to 50 %, 11.8 mm at 25 to 35 %,
+17 mm below."""
 CHI_SQUARE = 22.46
-"""99.9 % quantile of chi-square with 6 degrees of freedom: limit of a cycle's squared error."""
+"""99.9 % quantile of chi-square, 6 degrees of freedom, of a cycle's squared error."""
 HUBER = 1.345
-"""Threshold of the Huber kernel, standard deviations: 95 % efficiency for normal errors."""
+"""Huber threshold, standard deviations: 95 % efficiency."""
 
 
 def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
-    """Cut of a graph that separates at least as many pairs ``apart`` as it has edges; empty if there is none.
+    """Cut of a graph of unique ``edges`` that separates at least as many pairs ``apart`` as it has edges; empty if
+    none.
 
-    Of all minimum cuts between such pairs (Ford and Fulkerson 1956, unit capacities), the edge indices of the one with
-    most separated pairs per edge. ``edges`` must be unique.
+    Of all minimum cuts between such pairs (Ford and Fulkerson 1956, unit capacities), the one with most separated pairs
+    per edge.
     """
     if not edges or not apart:
         return set()
@@ -72,11 +71,10 @@ def _labels(ends: np.ndarray, count: int) -> np.ndarray:
 def drift_covariance(
     T_a_b: NDArray[np.float64], center: NDArray[np.float64], overlap: float = HALF
 ) -> NDArray[np.float64]:
-    """Covariance (6, 6) of a relative pose (4, 4), see ``Join``: drift at the middle (3,) of the common surface.
+    """Covariance (6, 6) of a relative pose (4, 4), see ``Join``: drift at the middle (3,) c of the common surface,
+    proportional to the square of ``HALF / overlap``.
 
-    A twist about that point c becomes one about the origin of a by ``v = v_c + c x omega``, and ``exp(d) T = T exp(e)``
-    with ``e = Ad(T)^-1 d``. The standard deviation is proportional to the square of ``HALF / overlap``, where overlap
-    is the common share of the smaller map.
+    About the origin of a it is ``v = v_c + c x omega``, and ``exp(d) T = T exp(e)`` with ``e = Ad(T)^-1 d``.
     """
     shift = np.eye(6)
     shift[:3, 3:] = se3.hat(center)
@@ -90,9 +88,9 @@ def _usual_covariance() -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Join:
-    """Relative pose of two runs: ``T_a_b`` (4, 4) maps the world of run b to the world of run a.
+    """Relative pose ``T_a_b`` (4, 4), world of run b to a.
 
-    Its error is ``T_a_b exp(e)`` with a twist e = (v, omega) of this covariance (6, 6).
+    Its error is ``T_a_b exp(e)`` with a twist e = (v, omega) of covariance (6, 6).
     """
 
     a: int
@@ -105,7 +103,7 @@ class Join:
         return self.T_a_b if start == self.a else se3.inverse(self.T_a_b)
 
     def motion_covariance(self, start: int) -> NDArray[np.float64]:
-        """Covariance of the error of that motion; ``(T exp(e))^-1 = T^-1 exp(-Ad(T) e)``."""
+        """Covariance of that motion; ``(T exp(e))^-1 = T^-1 exp(-Ad(T) e)``."""
         if start == self.a:
             return self.covariance
         J = se3.adjoint(self.T_a_b)
@@ -120,9 +118,9 @@ class RunGraph:
     """Poses of runs.
 
     Attributes:
-        components: Joined runs, ascending; the largest component first.
-        Ts: (n, 4, 4) world of each run to the world of the first run of its component.
-        kept, rejected: Joins that were used, and joins that contradict others.
+        components: Joined runs, ascending; the largest first.
+        Ts: (n, 4, 4) world of each run to its component's first run.
+        kept, rejected: Joins.
     """
 
     components: list[list[int]]
@@ -134,7 +132,7 @@ class RunGraph:
 def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] = ()) -> RunGraph:
     """Poses of ``count`` runs from pairwise relative poses.
 
-    ``denied`` are pairs whose maps disagree at the poses that these joins give (``supported``).
+    ``denied``: pairs that disagree at these poses (``supported``).
     """
     kept = consistent(supported(joins, denied))
     parts, Ts = components(count, kept), np.tile(np.eye(4), (count, 1, 1))
@@ -149,15 +147,14 @@ def solve(count: int, joins: Sequence[Join], denied: Sequence[tuple[int, int]] =
 
 
 def components(count: int, joins: Sequence[Join]) -> list[list[int]]:
-    """Connected runs, ascending; the largest component first, then by the first run."""
+    """Connected runs, ascending; the largest first."""
     number = _labels(np.array([(join.a, join.b) for join in joins], int).reshape(-1, 2), count)
     parts = [np.flatnonzero(number == n).tolist() for n in range(number.max(initial=-1) + 1)]
     return sorted(parts, key=lambda nodes: (-len(nodes), nodes[0]))
 
 
 def supported(joins: Sequence[Join], denied: Sequence[tuple[int, int]]) -> list[Join]:
-    """Remove joins that at least as many pairs of runs deny. False joins bring groups of runs to a wrong place,
-    where runs of both groups disagree."""
+    """Remove joins that at least as many pairs deny."""
     left = list(joins)
     while cut := best_cut([(join.a, join.b) for join in left], denied):
         left = [join for number, join in enumerate(left) if number not in cut]
@@ -168,8 +165,8 @@ def consistent(joins: Sequence[Join]) -> list[Join]:
     """Remove joins that a cycle contradicts and none confirms.
 
     - Triangles that close confirm their joins.
-    - A join between runs that confirmed joins connect is confirmed or rejected by this cycle.
-    - In any other cycle that does not close, all unconfirmed joins are rejected.
+    - Confirmed joins confirm or reject a join between their runs.
+    - In other cycles that do not close, all unconfirmed joins are rejected.
     - Joins in no cycle stay.
     """
     left = list(joins)
@@ -228,10 +225,8 @@ def _shortest(join: Join, neighbours: dict[int, list[tuple[Join, int]]]) -> Cycl
 
 
 def _closes(cycle: Cycle) -> bool:
-    """Whether the relative poses around a cycle compose to the identity within their errors.
-
-    With ``T = T_1 ... T_k`` an error ``exp(e_i)`` behind ``T_i`` changes ``T`` by ``Ad(T_i+1 ... T_k)^-1 e_i``.
-    """
+    """Whether a cycle closes within its errors: with ``T = T_1 ... T_k`` an error ``exp(e_i)`` changes ``T`` by
+    ``Ad(T_i+1 ... T_k)^-1 e_i``."""
     T, covariance = np.eye(4), np.zeros((6, 6))
     for join, start in reversed(cycle):
         J = se3.adjoint(se3.inverse(T))

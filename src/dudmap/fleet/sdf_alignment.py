@@ -1,7 +1,7 @@
-"""Refine the relative pose of two maps by registering the surface of each to the distances of the other.
+"""Refine the relative pose of two maps by the surface of each in the distances of the other.
 
-Surface points are aligned to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013),
-intensities as in the tracker (thesis eq. 4.32), in both directions.
+Points are aligned to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013), intensities as in
+the tracker (thesis eq. 4.32).
 """
 
 from dataclasses import dataclass
@@ -17,23 +17,20 @@ from dudmap.fleet.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_ma
 
 MAX_ITERATIONS = 40
 STOP = 1e-5
-"""Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
+"""Final twist (m, rad)."""
 MAD, LEAST_SHADE, LEAST_NOISE = 1.4826, 0.005, 0.05
-"""Standard deviation over median absolute value; smallest standard deviations of intensity (0..1) and distance
-(voxels). Shorter steps end the alignment of visits."""
+"""Standard deviation over median absolute value; smallest ones of intensity (0..1) and distance (voxels), also the last
+step's."""
 COLOR_SHARE = 0.1
-"""Factor of the standardised intensities of visits, whose errors are correlated over some hundred points by blur,
-light and timing."""
+"""Factor of the standardised intensities of visits, correlated over some hundred points."""
 SCALE = 0.5
-"""Residual at which the Geman-McClure weight of a distance falls to a quarter, voxels: a surface's standard
-deviation."""
+"""Residual of Geman-McClure weight a quarter, voxels."""
 SHRINKING = 0.5
-"""Factor per step of that residual, which starts at the truncation distance."""
+"""Its factor per step, from the truncation distance."""
 MIN_POINTS = 500
-"""Fewest points on the other map's surface that determine the pose."""
+"""Fewest points on the other surface."""
 MIN_STIFFNESS = 0.02
-"""Smallest over largest eigenvalue of the normal matrix of a determined pose, angles scaled by the extent of the
-points. A plain wall has 0."""
+"""Smallest over largest eigenvalue of a determined pose, angles scaled by extent; a plain wall has 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +39,10 @@ class SdfAlignment:
 
     Attributes:
         T_a_b: (4, 4) world of b to world of a.
-        converged: Whether the last step was short and enough points lie on the surface of the other map.
-        residual: Root mean square distance of the points, weighted as in the refinement, metres.
-        stiffness: Smallest over largest eigenvalue, 0..1; see ``MIN_STIFFNESS``.
-        center: (3,) middle of the common surface in the world of a, metres.
+        converged: Whether the last step was short, with enough points on the other surface.
+        residual: Weighted root mean square distance, metres.
+        stiffness: See ``MIN_STIFFNESS``.
+        center: (3,) middle of the common surface, world of a, metres.
     """
 
     T_a_b: NDArray[np.float64]
@@ -63,12 +60,9 @@ def align_maps(
     T_a_b: NDArray[np.float64],
     changed: bool = False,
 ) -> SdfAlignment:
-    """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
-
-    Its error must be below the truncation distance. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2``, with
-    ``c`` shrinking per step (graduated non-convexity, Yang et al. 2020); intensities the tracker's weights, if
-    ``changed`` also Geman-McClure weights.
-    """
+    """Refine ``T_a_b`` (4, 4), in error by less than the truncation, by Gauss-Newton steps on distances and
+    intensities. Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with shrinking ``c`` (graduated
+    non-convexity, Yang et al. 2020); intensities the tracker's, if ``changed`` also Geman-McClure's."""
     tracker, exposure, stiffness, residual, converged = TrackerConfig(), (1.0, 0.0), 0.0, np.inf, False
     center, at_points, scale, spread, noise = np.zeros(3), np.inf, a.truncation, 1.0, a.truncation
     for _ in range(MAX_ITERATIONS):
@@ -105,8 +99,6 @@ def align_maps(
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Residuals and their derivatives by a left twist of T_a_b; points in the world of a."""
-
     points: NDArray[np.float64]
     distance: NDArray[np.float64]
     J_distance: NDArray[np.float64]
@@ -125,8 +117,6 @@ def _rows(
     *,
     of_a: bool,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Fields of ``_Rows`` of one surface in the other map, points (n, 3) in the world of a. Points of b move by ``v
-    + omega x p`` in map a; map b moves so against points of a."""
     samples, (gain, offset) = sample_map(other, transformed(T_other_a, points)), exposure
     near = (samples.state == OBSERVED) & (np.abs(samples.sdf) < IN_BAND * other.truncation)
     lit = near & (samples.intensity > 0) & (surface.intensity > 0)
@@ -142,7 +132,6 @@ def _rows(
 
 
 def _twist_rows(points: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 6) by a left twist (v, omega) of values with gradients (n, 3) at points (n, 3)."""
     return np.hstack([gradients, np.cross(points, gradients)])
 
 
@@ -154,7 +143,6 @@ def _normal_equations(
 
 
 def _stiffness(H: NDArray[np.float64], center: NDArray[np.float64], points: NDArray[np.float64]) -> float:
-    """Smallest over largest eigenvalue of a normal matrix about the centre of the points, angles scaled by extent."""
     extent = max(float(np.sqrt(np.mean(np.sum(np.square(points - center), axis=1)))), 1e-6)
     shift = np.eye(6)
     shift[:3, 3:] = se3.hat(center)  # converts a rotation about the centre to one about the origin and a translation
@@ -164,7 +152,6 @@ def _stiffness(H: NDArray[np.float64], center: NDArray[np.float64], points: NDAr
 
 
 def _exposure(shade_a: NDArray[np.float64], shade_b: NDArray[np.float64]) -> tuple[float, float]:
-    """Gain and offset that give the intensities of b the mean and spread of a."""
     if len(shade_a) < MIN_POINTS:
         return 1.0, 0.0
     gain = float(np.clip(shade_a.std() / max(shade_b.std(), 1e-6), 0.5, 2.0))

@@ -1,4 +1,4 @@
-"""Checks of the runs of a merge, worker processes, and the data that each process caches."""
+"""Checks of a merge's runs, worker processes, and their caches."""
 
 import multiprocessing
 import os
@@ -31,12 +31,12 @@ from dudmap.input_files import DAMAGE, open_arrays
 
 TRAJECTORY_FILE = "trajectory.txt"
 MAX_RUNS = 8000
-"""Largest number of runs: the sums of the fusion have 32 bits (``BlockSums``)."""
+"""Runs: fusion sums have 32 bits (``BlockSums``)."""
 
 OPEN_MAPS = 2
-"""Whole maps in memory: the two of a pair."""
+"""Whole maps in memory: a pair."""
 SMALL_PARTS = 32
-"""Runs in memory with keyframes (some MB), surface points (1 MB) or block lists (some MB)."""
+"""Runs in memory with keyframes, surface points (1 MB) or block lists."""
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -44,10 +44,8 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, eq=False)
 class MapHeader:
-    """A map file without its voxels: parameters, block coordinates (n, 3), and which blocks (n,) own voxels.
-
-    Blocks without voxels are known to be empty.
-    """
+    """A map file without voxels: parameters, block coordinates (n, 3), and which (n,) own voxels; the others are
+    empty."""
 
     camera: Camera
     config: VolumeConfig
@@ -58,7 +56,7 @@ class MapHeader:
 
     @classmethod
     def read(cls, path: Path) -> "MapHeader":
-        """Read a map file without decompressing its voxels.
+        """Read a map file without decompressing voxels.
 
         Raises:
             MapError: The file is damaged or not a map of this version.
@@ -77,10 +75,10 @@ class MapHeader:
 
 
 def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
-    """Check run folders before a merge, without reading their voxels; return the parameters of the first map.
+    """Check run folders before a merge; return the first map's parameters.
 
     Raises:
-        ConfigError: There are too few or too many runs, one is named twice, or their voxels differ in size.
+        ConfigError: Too few or many runs, one twice, or different voxel sizes.
         MapError: A run folder is incomplete or damaged.
         DudmapError: ``out`` is one of the runs.
     """
@@ -134,17 +132,14 @@ def _points(run: Path) -> SurfacePoints:
 
 @lru_cache(maxsize=SMALL_PARTS)
 def reached_blocks(run: Path, pose: bytes) -> ReachedBlocks:
-    """Blocks of the world that a run reaches; ``pose`` are the 128 bytes of its pose (4, 4)."""
+    """Blocks of the world that a run at ``pose`` (128 bytes of (4, 4)) reaches."""
     header = MapHeader.read(run / MAP_FILE)
     T = np.frombuffer(pose).reshape(4, 4)
     return ReachedBlocks.of(header.coords, header.has_voxels, T, header.volume().block_size)
 
 
 class Workers:
-    """Processes with one thread each; a single one is this process.
-
-    Attributes:
-    """
+    """Processes with one thread each, or this process."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -164,7 +159,7 @@ class Workers:
         """Yield the results of jobs in their order.
 
         Raises:
-            DudmapError: The system ended a worker, usually because memory ran out.
+            DudmapError: The system ended a worker, usually without memory.
         """
         if self._pool is None:
             measured = (_measured(function, job) for job in jobs)

@@ -1,4 +1,4 @@
-"""Work for a frame that no later frame waits for."""
+"""Work that no later frame waits for."""
 
 from collections import deque
 from collections.abc import Callable
@@ -8,14 +8,14 @@ from types import TracebackType
 from dudmap.core.objects.moving_objects import MOST_WAITING
 
 WAITING = 2
-"""Most waiting jobs; each holds the images of a frame."""
+"""Waiting jobs; each holds a frame's images."""
 POSTPONED = MOST_WAITING
-"""Most jobs that wait for an idle moment: one second of frames. Live runs discard older moving objects, not frames."""
+"""Jobs that wait for an idle moment: one second; live runs then discard older moving objects."""
 
 
 class Background:
-    """Does jobs in order in another thread; a later call raises the error of a job. ``postponed`` jobs of a live run
-    wait until the caller is idle."""
+    """Does jobs in order in another thread; a later call raises a job's error. ``postponed`` jobs wait until the caller
+    is idle."""
 
     def __init__(self, *, postponed: bool = False) -> None:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="dudmap-background")
@@ -38,7 +38,7 @@ class Background:
             self._thread.shutdown()
 
     def do(self, job: Callable[[], None]) -> None:
-        """Add a job, once at most ``WAITING`` others are left (``POSTPONED`` for postponed jobs)."""
+        """Add a job once at most ``WAITING`` (``POSTPONED``) others are left."""
         if self._postponed is None:
             self.wait(WAITING)
             self._jobs.append(self._thread.submit(job))

@@ -33,17 +33,16 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 START_FRAMES, MIN_FRAMES = 300, 90
-"""Frames at the start of a recording that calibrate a run, and fewest such frames."""
+"""Frames that calibrate a run at its start, and fewest such frames."""
 WIDTH, INTERVAL = 320, 1 / 30
 """Width (pixels) and largest interval (s) of the tracked images. A keyframe's velocity is the mean over two
-intervals: longer ones reduce pose noise and add shake."""
+intervals."""
 SPACING, SHORT = 0.2, 5.0
-"""Time between keyframes, seconds, in recordings longer than ``SHORT``; only keyframes and their neighbours are
-read."""
+"""Seconds between keyframes in recordings longer than ``SHORT``; only keyframes and neighbours are read."""
 GAP = 2.5
 """Largest time between the neighbours of a keyframe, usual intervals."""
 VOXEL_SIZE = 0.02
-"""Smallest voxel size of the map that tracks these frames, reference depths."""
+"""Smallest voxel size of the tracking map, reference depths."""
 
 
 def calibrate_start(
@@ -53,10 +52,10 @@ def calibrate_start(
     progress: "Callable[[int, int], None]",
     ignore: "NDArray[np.bool_] | None" = None,
 ) -> Calibration | None:
-    """Calibration estimated from the first frames of a recording; None without one, with the reason in the log.
+    """Calibration from the first frames of a recording; None without one, with the reason in the log, and for short
+    recordings.
 
-    Short recordings are not calibrated. ``progress`` receives the numbers of tracked and of all frames. Pixels
-    ``ignore`` (H, W) are never used.
+    ``progress`` receives the numbers of tracked and of all frames. Pixels ``ignore`` (H, W) are never used.
     """
     count = min(len(sequence), START_FRAMES, max_frames)
     if not has_color(sequence):
@@ -79,9 +78,9 @@ def calibrate_start(
 
 
 def known_calibration(sequence: "Sequence") -> Calibration:
-    """Calibration given by a recording, else of registered colours, with a corrected focal length if needed.
+    """Calibration of a recording, else of registered colours.
 
-    The focal length is corrected, with a warning, if the edges of depth and colour clearly contradict it.
+    The focal length is corrected, with a warning, if edges of depth and colour clearly contradict it.
     """
     if not has_color(sequence):
         raise DatasetError(f"{sequence.name} has no colour images: there is no colour camera to calibrate")
@@ -102,10 +101,10 @@ def calibrate_sequence(
     progress: "Callable[[int, int], None]" = lambda done, total: None,
     ignore: "NDArray[np.bool_] | None" = None,
 ) -> Estimate:
-    """Track a recording quickly with the given calibration, and estimate a better one.
+    """Track a recording quickly, and estimate a better calibration; images at an ``INTERVAL``, about ``WIDTH`` wide,
+    suffice.
 
-    The poses are estimated too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, suffice. For ``progress``
-    and ``ignore`` see ``calibrate_start``.
+    For ``progress`` and ``ignore`` see ``calibrate_start``.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -149,7 +148,7 @@ def calibrate_sequence(
 
 
 def _quick(config: Config, halvings: int) -> Config:
-    """Parameters for the excerpt: larger voxels, no reports."""
+    """Parameters for the excerpt."""
     preprocess = config.preprocess
     return config.override([
         "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",
@@ -167,7 +166,7 @@ def _halved(mask: "NDArray[np.bool_]", halvings: int) -> "NDArray[np.bool_]":
 
 
 class _Excerpt:
-    """Keyframes of a recording and their neighbours, with images halved by 2x2 blocks."""
+    """Keyframes of a recording and their neighbours, halved by 2x2 blocks."""
 
     def __init__(
         self, sequence: "Sequence", given: Calibration, halvings: int, count: int, reference_depth: float

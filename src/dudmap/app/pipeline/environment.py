@@ -13,10 +13,8 @@ from dudmap.version import __version__
 
 
 def peak_rss_mb() -> float | None:
-    """Peak resident memory of this process so far, MB; None on Windows.
-
-    On Linux ``VmHWM`` is read: ``ru_maxrss`` also counts the memory of the process that started this one.
-    """
+    """Peak resident memory of this process so far, MB; None on Windows. Linux reads ``VmHWM``, because ``ru_maxrss``
+    includes the parent process."""
     if sys.platform == "win32":
         return None
     status = Path("/proc/self/status")
@@ -31,7 +29,7 @@ def peak_rss_mb() -> float | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of dudmap and of the libraries that its results depend on."""
+    """Versions of dudmap and its libraries."""
     import cv2
 
     return {

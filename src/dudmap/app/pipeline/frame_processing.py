@@ -36,8 +36,8 @@ def process_source(
     poses: "GivenPoses | None" = None,
     shedding: Shedding | None = None,
 ) -> None:
-    """Process one frame, count it, save its mask, and report it; files and moving objects are done in the
-    background. ``shedding`` chooses the work that a live run omits."""
+    """Process one frame, count it, save its mask, and report it; files and moving objects are done in the background.
+    ``shedding`` chooses the work that a live run omits."""
     index, read = source.number, source.read
     if record.dropped is not None:
         record.dropped += source.dropped

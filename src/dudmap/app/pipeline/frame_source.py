@@ -1,4 +1,4 @@
-"""Frames and masks of a recording, read ahead in order, or of a camera as they arrive."""
+"""Frames and masks of a recording, read ahead, or of a camera as they arrive."""
 
 import threading
 import time
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 AHEAD = 4
-"""Number of frames of a recording on disk that are read ahead of the processed one."""
+"""Frames read ahead."""
 
 
 class FrameRead(NamedTuple):
-    """Result of reading one frame; an image that cannot be read is replaced by its error.
+    """Result of reading one frame; an unreadable image is replaced by its error.
 
     Attributes:
         true_mask: (H, W) true dynamic mask, None if unknown.
         ms: Reading time of the frame, milliseconds; 0 for a camera.
-        given_mask: (H, W) external dynamic mask, None if there is none.
+        given_mask: (H, W) external dynamic mask, or None.
     """
 
     frame: Frame | FrameError
@@ -49,7 +49,7 @@ class SourceFrame(NamedTuple):
 
     Attributes:
         number: Number of the frame in the recording.
-        arrival: Time of arrival in a live run, seconds of ``time.perf_counter``; 0 otherwise.
+        arrival: In a live run, seconds of ``time.perf_counter``; else 0.
     """
 
     number: int
@@ -66,10 +66,7 @@ def read_ahead(
     slam: "Slam | None" = None,
     start: int = 0,
 ) -> Generator[SourceFrame]:
-    """Yield frames ``start`` to ``count`` - 1 in order.
-
-    One thread reads, and with ``slam`` prepares them, up to ``ahead`` frames ahead.
-    """
+    """One thread reads, and with ``slam`` prepares, up to ``ahead`` frames ahead."""
 
     def read(index: int) -> SourceFrame:
         begin = time.perf_counter()
@@ -93,7 +90,7 @@ def read_ahead(
 
 
 class FrameQueue:
-    """Thread-safe queue between a camera and its consumer: the newest item and items at most ``MAX_WAIT`` older."""
+    """Thread-safe queue of the newest item and items at most ``MAX_WAIT`` older."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -118,7 +115,7 @@ class FrameQueue:
             return self._held.pop(0) if self._held else None
 
     def close(self) -> None:
-        """Declare the end of the stream; stored items can still be taken."""
+        """Declare the end of the stream."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -131,11 +128,10 @@ def arriving(
     recorder: "Recorder | None" = None,
     idle: Callable[[], bool] = lambda: False,
 ) -> Generator[SourceFrame]:
-    """Yield frames of a camera, which a thread takes and prepares; close the camera at the end.
+    """Yield frames of a camera, taken and prepared in a thread; close the camera at the end.
 
-    Frames without room in the ``FrameQueue`` are dropped and counted in the next frame. The ``recorder`` receives all
-    frames. ``idle`` is called while no frame waits: it does a few milliseconds of other work and returns True, or has
-    none.
+    The ``recorder`` receives all frames; the queue drops and counts frames without room. ``idle`` is called while no
+    frame waits: a few milliseconds of work and True, or none.
 
     Raises:
         CameraError: The camera stopped to deliver frames.

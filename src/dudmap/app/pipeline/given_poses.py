@@ -1,4 +1,4 @@
-"""Poses given by a recording or a file: read, tested against the images, looked up by time."""
+"""Given poses: read, tested against the images, looked up by time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ RECORDING = "recording"
 SAME_TIME = 1e-4
 """Stamps that differ by less are equal, seconds: files have four digits."""
 LARGEST_GAP = 0.05
-"""Largest time from a frame to the neighbouring poses for interpolation, seconds."""
+"""Largest time from a frame to interpolated poses, seconds."""
 POSES = "given_poses.txt"
 
 
@@ -31,18 +31,18 @@ class GivenPoses:
 
     Attributes:
         trajectory: The poses; frames without one are not in it.
-        role: ``given`` if they are the result, ``refined`` if registration starts from them.
+        role: ``given`` (the result) or ``refined`` (start of registration).
     """
 
     trajectory: Trajectory
     role: Literal["given", "refined"]
 
     def at(self, timestamp: float) -> NDArray[np.float64] | None:
-        """Pose (4, 4) of the frame at a time in seconds, None if it has none."""
+        """Pose (4, 4) at a time in seconds, or None."""
         return _at(self.trajectory, timestamp)
 
     def corrections(self, found: Trajectory) -> dict[str, float]:
-        """Median and largest difference of refined poses to the given ones, millimetres and degrees."""
+        """Median and largest difference of refined to given poses, millimetres and degrees."""
         pairs = [(T, self.at(stamp)) for stamp, T in zip(found.timestamps, found.Ts_world_camera, strict=True)]
         motions = [se3.inverse(given) @ T for T, given in pairs if given is not None]
         if not motions:
@@ -57,9 +57,9 @@ def given_poses(name: str, sequence: "Sequence", convention: str | None = None, 
     """The poses of the frames of a recording.
 
     Args:
-        name: ``recording`` for its own poses, else a file of poses, or a folder with one file per frame.
-        convention: Format (``pose_files.FORMATS``) and convention (``pose_conventions.WORDS``), separated by commas.
-            None recognises the format. The default is camera-to-world, x right, y down, z forward, metres.
+        name: ``recording``, a file of poses, or a folder with one file per frame.
+        convention: Format (``pose_files.FORMATS``) and convention (``pose_conventions.WORDS``), separated by commas;
+            None recognises the format. Default: camera-to-world, x right, y down, z forward, metres.
         refine: Whether registration starts from the poses.
 
     Raises:
@@ -132,8 +132,7 @@ def _natural(path: Path) -> tuple[int, str]:
 
 
 def _matrices(path: Path) -> NDArray[np.float64] | None:
-    """Poses (N, 4, 4) of four rows of four numbers each; rows of three numbers between poses are skipped (Open3D's
-    .log). None for other files."""
+    """Poses (N, 4, 4) of four rows each, with rows of three numbers between (Open3D's .log), or None."""
     with damaged(DatasetError, path):
         lines = [line.split() for line in read_text(path).splitlines() if line.strip() and line[0] != "#"]
         rows = [line for line in lines if len(line) != 3]
@@ -147,7 +146,7 @@ def _matrices(path: Path) -> NDArray[np.float64] | None:
 
 
 def stored_poses(folder: Path, role: Literal["given", "refined"]) -> GivenPoses:
-    """Poses stored in a run folder; a resumed run uses the same numbers."""
+    """Poses stored in a run folder."""
     return GivenPoses(Trajectory.load(folder / POSES), role)
 
 

@@ -1,4 +1,4 @@
-"""Find faults in the images of a recording: focal length, mirrored images, no texture, a resting plane in the depth."""
+"""Faults in the images of a recording: focal length, mirrored, no texture, resting plane."""
 
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -19,58 +19,53 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 PAIRS, GAP = 12, 10
-"""Frame pairs compared, and frames between the two: a third of a second, 5 to 20 degrees by hand."""
+"""Compared frame pairs, and frames between both: 5 to 20 degrees by hand."""
 NEAR = 0.015
-"""Largest distance of a matched point from the affine motion, share of the depth: 3 sigma of a Kinect."""
+"""Distance of a matched point from the affine motion, share of the depth: 3 sigma of a Kinect."""
 POINTS = 500
 LEAST_POINTS, LEAST_PAIRS = 20, 6
 AGREEMENT, SHARE = 0.15, 0.6
-"""Largest deviation of an agreeing pair from the median, share of it; smallest share of agreeing pairs."""
+"""Deviation of agreeing pairs from the median, share of it; smallest share of agreeing pairs."""
 WRONG = 0.2
-"""Smallest reported relative error of a focal length; correct ones of five recordings erred by up to 0.12."""
+"""Smallest reported relative error of a focal length; correct ones erred by up to 0.12."""
 DISTANCES = 4000
 
 WIDTH = 160
 STEP, STEEPEST = 0.08, 4.0
 """Smallest depth edge, share of the depth; largest colour edge, multiple of the mean gradient."""
 NEIGHBOURHOOD = 41
-"""Width of the neighbourhood whose mean is subtracted, pixels."""
+"""Width of the subtracted mean, pixels."""
 TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
-"""Ways in which one of the two images may be turned: steps through its rows and columns."""
+"""Ways in which an image may be turned: steps through rows and columns."""
 GAIN, MAYBE, SIGNIFICANT = 0.04, 3.5, 5.0
-"""Limits for a turn of depth against colour: smallest gain in edge correlation. Smallest correlations for a possible
-and a certain turn, standard deviations of accidental ones. Of 360 unrelated pairs 3 exceed the first and none the
-second; of 261 turned excerpts 257 and 243 do."""
+"""Limits for a turn of depth against colour: gain in edge correlation; correlations of a possible and a certain turn,
+standard deviations of accidental ones (3 and 0 of 360 unrelated pairs, 257 and 243 of 261 turned ones)."""
 APART = 12
-"""Shift beyond which edges coincide only by accident, pixels of ``WIDTH``."""
+"""Shift of accidental coincidence, pixels of ``WIDTH``."""
 FEWEST = 4
 MAGNIFICATIONS = np.exp(np.arange(-12, 13) / 20)
-"""Compared ratios of the colour camera's focal length to the given one, up to 1.7 for the depth camera's."""
+"""Compared ratios of focal lengths, colour to given."""
 REGISTERED = np.abs(np.log(MAGNIFICATIONS)) < 0.16
-"""Magnifications that a calibration finds by itself."""
+"""Magnifications that a calibration finds."""
 SHIFT = 3
-"""Largest shift by the baseline of both cameras, pixels of ``WIDTH``: 20 mm at 1 m."""
+"""Largest shift by the cameras' baseline, pixels of ``WIDTH``: 20 mm at 1 m."""
 LOOKS = 12, 48
-"""Frames that search another magnification, and that must prove it."""
+"""Frames that search another magnification, and that prove it."""
 PROVEN = 4.0
-"""Smallest gain of another magnification in standard errors over the frames."""
+"""Its smallest gain, standard errors."""
 MAGNIFIED_GAIN = 0.01
-"""Smallest gain in correlation for another magnification; registered images stay below -0.02."""
+"""Its smallest gain in correlation; registered images stay below -0.02."""
 FLAT = 0.01
-"""Largest standard deviation from a plane, as a share of the depth, of a depth image without relief."""
+"""Largest standard deviation from a plane of depth without relief, share of the depth."""
 STILL = 0.2
-"""Largest spread of the distance of a resting plane over the frames, standard deviations of a measurement; moving
-cameras spread more."""
+"""Largest spread of a resting plane's distance, standard deviations of a measurement."""
 CHANGED = 0.05
-"""Smallest mean difference of intensities, share of their mean, that exposure does not explain."""
+"""Smallest relative intensity difference that exposure does not explain."""
 
 
 def focal_error(sequence: "Sequence") -> float | None:
-    """Given focal length over the focal length that preserves point distances between two frames; None if unknown.
-
-    With the factor s of x and y, s^2 (dx^2 + dy^2) + dz^2 of two points is equal in both frames, linear in s^2. Matches
-    fit one affine motion at any focal length.
-    """
+    """Given focal length over the one that preserves point distances between frames; None if unknown. With the factor s
+    of x and y, s^2 (dx^2 + dy^2) + dz^2 of two points is equal in both frames."""
     found, rng = [], np.random.default_rng(0)
     for index in np.unique(np.linspace(0, max(len(sequence) - 1 - GAP, 0), PAIRS).astype(int)):
         try:
@@ -96,7 +91,6 @@ def focal_error(sequence: "Sequence") -> float | None:
 
 
 def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Matched points (N, 3) of two frames, each in its camera, that fit one affine motion."""
     sift, points = SiftExtractor(POINTS), []
     seen = [sift.extract(reduced_grey(frame.rgb, frame.rgb.shape[1] // 2)) for frame in frames]
     pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0)
@@ -116,7 +110,7 @@ def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float6
 
 
 def image_warnings(frames: "list[Frame]") -> list[str]:
-    """Warnings about frames spread over a recording; none for fewer than four frames."""
+    """Warnings about frames of a recording; none for fewer than four."""
     frames = [frame for frame in frames if frame.color is not None]
     if len(frames) < FEWEST:
         return []
@@ -135,7 +129,7 @@ def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _turn_warnings(frames: "list[Frame]") -> list[str]:
-    """Warn if edges of depth and colour coincide only after one image is turned."""
+    """Warn if edges coincide only after an image is turned."""
     pairs = [_edges(frame) for frame in frames if frame.depth.shape == frame.rgb.shape[:2]]
     if len(pairs) < FEWEST or len({edges.shape for edges, _ in pairs}) > 1:
         return []
@@ -154,10 +148,6 @@ def _turn_warnings(frames: "list[Frame]") -> list[str]:
 
 
 def _agreement(edges: NDArray[np.float32], steps: NDArray[np.float32]) -> tuple[float, float, float]:
-    """Mean correlation of edge images (N, h, w), standard deviation and maximum of shifted correlations.
-
-    All frames are shifted alike, because frames of one view count once.
-    """
     power = np.sqrt(np.mean(edges**2, axis=(1, 2)) * np.mean(steps**2, axis=(1, 2)))
     products = np.fft.irfft2(np.fft.rfft2(edges) * np.conj(np.fft.rfft2(steps)), s=edges.shape[1:]) / edges[0].size
     mean = np.mean(products / np.maximum(power, 1e-9)[:, None, None], axis=0)
@@ -167,10 +157,7 @@ def _agreement(edges: NDArray[np.float32], steps: NDArray[np.float32]) -> tuple[
 
 
 def color_magnification(sequence: "Sequence") -> float | None:
-    """Ratio of the colour camera's focal length to the given one (or the depth camera's) at which edges coincide.
-
-    None if the ratio is near 1, where the calibration finds it, or is not proven.
-    """
+    """Ratio of colour's focal length to the given one at which edges coincide; None if unproven or near 1."""
     given = sequence.calibration or Calibration.registered(sequence.camera)
     agreement: dict[int, NDArray[np.float32]] = {}
     found = None
@@ -190,8 +177,8 @@ def color_magnification(sequence: "Sequence") -> float | None:
 
 
 def _best_magnification(agreement: NDArray[np.float32]) -> tuple[float, float] | None:
-    """Best magnification in ``agreement`` (frames, magnifications, shifts), and its gain over registered images in
-    standard errors, or None."""
+    """Best magnification in ``agreement`` (frames, magnifications, shifts), and its gain in standard errors, or
+    None."""
     mean = agreement.mean(axis=0)
     best, shift = (int(n) for n in np.unravel_index(np.argmax(mean), mean.shape))
     near = np.unravel_index(np.argmax(np.where(REGISTERED[:, None], mean, -1)), mean.shape)
@@ -210,7 +197,7 @@ def unregistered(magnification: float) -> str:
 
 
 def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -> NDArray[np.float32]:
-    """Edge correlations (magnifications, shifts) of depth and magnified colours."""
+    """Edge correlations (magnifications, shifts)."""
     edges, steps = _edges(frame)
     steps, out = _flattened(steps, np.ones_like(steps)), []
     size, border = steps.shape[::-1], (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
@@ -255,7 +242,7 @@ def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[
 
 
 def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> list[str]:
-    """Warn of depth of one plane at rest while the colours change."""
+    """Warn of one resting plane of depth while colours change."""
     planes = _planes(frames)
     exposed = [gray / (gray.mean() + np.float32(1e-3)) for gray in grays]
     changes = [np.abs(b - a).mean() for a, b in pairwise(exposed) if a.shape == b.shape]
@@ -272,8 +259,6 @@ def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> 
 
 
 def _planes(frames: "list[Frame]") -> tuple[NDArray[np.float64], float] | None:
-    """Distances (N, 5) of the plane of every depth image at centre and corners, and the noise about it, metres. None
-    if an image is no plane. The inverse depth of a plane is linear in row and column."""
     distances, sigmas = [], []
     places = np.array([[0, 0, 1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, 1]], np.float64)
     for frame in frames:

@@ -1,4 +1,4 @@
-"""Images of a run that are kept in its folder, as a recording in TUM layout."""
+"""Images kept in the run folder, as a recording in TUM layout."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,16 +21,15 @@ if TYPE_CHECKING:
 
 FOLDER = "images"
 APART, APART_DEG, SECONDS = 0.025, 1.5, 0.3
-"""Motion (metres, degrees) and time after which a frame is kept: half of the steps between views of a texture, of which
-the sharper frame is used."""
+"""Motion (metres, degrees) and time after which a frame is kept: half a texture's step between views."""
 JPEG_QUALITY = 95
 
 
 class ImageKeeper(RunObserver):
-    """Keeps colour (JPEG) and depth (PNG) of tracked frames whenever the camera has moved.
+    """Keeps colour (JPEG) and depth (PNG) of tracked frames when the camera has moved.
 
     Args:
-        source: The recording or camera; None continues the folder of an interrupted run.
+        source: Recording or camera; None continues an interrupted run.
     """
 
     in_background = True
@@ -57,7 +56,7 @@ class ImageKeeper(RunObserver):
         write_text(self._folder / "intrinsics.txt", "\n".join(lines) + "\n")
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """Keep a frame with colour and a pose, if the camera has moved."""
+        """Keep a frame with colour and pose, if the camera has moved."""
         import cv2
 
         from dudmap.app.views.rendering import depth_units

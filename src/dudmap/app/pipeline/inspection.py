@@ -25,34 +25,32 @@ if TYPE_CHECKING:
 DEPTH_ALONE = "there are no colour images: the camera is tracked by distances alone, and the mesh has no colours"
 SAMPLES = 12
 NEAR, FAR = 0.1, 8.0
-"""Median depths, metres, outside of which an assumed depth unit is doubted."""
+"""Median depths, metres, outside of which an assumed unit is doubted."""
 LEAST, LARGEST = 0.05, 25.0
-"""Median depths, metres, outside of which any unit is doubted: wrist cameras begin at 0.07 m, outdoor stereo ends at
-20 to 40 m."""
+"""Median depths, metres, outside of which any unit is doubted: wrist cameras 0.07 m, outdoor stereo 20 to 40 m."""
 LEFT_OUT = 0.1
-"""Share of measurements outside of the depth range that causes a warning."""
+"""Share outside the depth range that warns."""
 NEAREST, FARTHEST = 0.2, 10.0
-"""Smallest plausible 5th and largest plausible 95th percentile of depths, metres, if the median lies outside of
-``SEEN``."""
+"""Plausible 5th and 95th percentile of depths, metres, if the median is outside ``SEEN``."""
 SEEN = (0.4, 4.0)
-"""Median depths, metres, at which the scale is not doubted."""
+"""Median depths, metres, of undoubted scale."""
 FEW_READINGS = 0.2
-"""Share of pixels with depth below which depth is sparse."""
+"""Share of pixels with depth below which it is sparse."""
 GAP = 3.0
-"""Time between frames that is a gap, as a multiple of the median."""
+"""Gap between frames, medians."""
 LEFT_OVER = 0.02
-"""Share of images without a partner that causes a warning."""
+"""Share of unpaired images that warns."""
 SLOW, FAST = 1.0, 0.001
-"""Median time between frames, seconds, outside of which the time unit or the camera is wrong."""
+"""Median frame interval, seconds, outside of which time unit or camera is wrong."""
 LATE = 0.015
-"""Median time between a frame's colour and depth image, seconds, that causes a warning: half a frame."""
+"""Median time between colour and depth, seconds, that warns: half a frame."""
 RUN = 6
 TUM_ENDED = 1356998400.0
-"""The year 2013, seconds since 1970; later recordings named as in TUM RGB-D are of another camera."""
+"""The year 2013, seconds since 1970, after which no recording is TUM RGB-D's."""
 SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
-"""Depth scales in use, units per metre; the first that fits replaces an implausible one."""
+"""Depth scales, units per metre; the first that fits replaces an implausible one."""
 USUAL = (0.4, 8.0)
-"""Median depth, metres, that a proposed scale must give."""
+"""Median depth, metres, of a proposed scale."""
 
 
 @dataclass
@@ -61,20 +59,19 @@ class Inspection:
 
     Attributes:
         duration: From the first to the last depth image, seconds.
-        rate: Depth images per second (from the median interval).
-        color_rate: Colour images per second; None if their times are unknown.
-        gaps: (time of the frame before the gap, length) of every gap, seconds.
-        camera, color_camera: Intrinsics of the depth and the colour camera; equal for registered images.
-        T_color_depth: 4x4 motion between them, row by row; None for registered images.
-        sources: Origin of intrinsics, depth unit and times: a file, a name, an option, or an assumption.
-        depth_scale: Units of a 16-bit depth image per metre.
-        median_depth: Of all measurements of the sampled frames, metres; None without any.
+        rate: Depth images per second (median).
+        color_rate: Colour images per second, or None.
+        gaps: (time of the frame before, length), seconds.
+        camera, color_camera: Depth and colour camera; equal for registered images.
+        T_color_depth: 4x4, row by row; None for registered images.
+        sources: Origin of intrinsics, depth unit and times.
+        depth_scale: 16-bit units per metre.
+        median_depth: Of the sampled frames, metres, or None.
         valid_depth: Share of pixels with depth.
-        depth_range, voxel_size: Given, or chosen from the depth, metres.
-        too_near, too_far: Shares of the measurements below and above ``depth_range``.
+        depth_range, voxel_size: Given or chosen, metres.
+        too_near, too_far: Shares below and above ``depth_range``.
         ground_truth: Number of ground truth poses, 0 without.
-        repeats: Shares of frames that repeat the previous one: both images (``frame``), only ``depth`` or only
-            ``color``; empty if not compared.
+        repeats: Shares of frames that repeat the previous ``frame``, ``depth`` or ``color``; empty if not compared.
     """
 
     name: str
@@ -102,14 +99,14 @@ class Inspection:
     warnings: list[str] = field(default_factory=list)
 
     def distinct_rate(self, stream: str) -> float | None:
-        """Distinct images per second of the ``depth`` or ``color`` stream; None if unknown."""
+        """Distinct images per second of ``depth`` or ``color``; None if unknown."""
         if self.rate is None or not self.repeats:
             return None
         return self.rate * (1 - self.repeats["frame"] - self.repeats[stream])
 
 
 def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int, Frame]], list[str]]":
-    """Numbers and frames of an evenly spread selection, and the errors of unreadable frames."""
+    """Numbers and frames of an even selection, and errors of unreadable ones."""
     frames, unreadable = [], []
     for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)):
         try:
@@ -120,8 +117,8 @@ def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int,
 
 
 def repeats(sequence: "Sequence") -> dict[str, float]:
-    """Shares of RUN consecutive frames at SAMPLES places bit-identical to the previous one: ``frame``, ``depth`` or
-    ``color``; empty if no two can be read."""
+    """Shares of RUN consecutive frames at SAMPLES places identical to the previous one: ``frame``, ``depth`` or
+    ``color``; empty if unreadable."""
     from dudmap.core.frames.stream_check import repeated
 
     counts, pairs = {"frame": 0, "depth": 0, "color": 0}, 0
@@ -149,9 +146,10 @@ def inspect(
     unreadable: list[str] | None = None,
     config: Config | None = None,
 ) -> Inspection:
-    """Describe a recording and its suspected faults; ``frames`` and ``unreadable`` are results of ``sample``.
+    """Describe a recording and its suspected faults.
 
-    ``config`` gives the depth range; None chooses it from the frames, as ``dudmap run`` does.
+    ``frames``, ``unreadable``: results of ``sample``. ``config`` gives the depth range; None chooses it as ``dudmap
+    run`` does.
     """
     if frames is None:
         frames, unreadable = sample(sequence)

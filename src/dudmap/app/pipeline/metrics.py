@@ -33,19 +33,18 @@ class RunRecord:
     """Metrics of the frames processed so far.
 
     Attributes:
-        rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
-        unreadable: One sentence per frame that could not be read or had another size.
-        checks: Figure and limit of all checks per registered frame (``core/tracking/checks.py``).
-        repeated: Number of frames that repeat the previous frame, its depth or its colour, by the repeated part.
-        rejected: Number of frames rejected for a fault of the stream, by kind. Frames with a readable image of the
-            correct size are lost as well.
-        mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
-        movers: Line of movers.jsonl per frame with moving objects: a third of the memory of the object.
-        residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.masks``), or 0.
-        readings: Numbers of depth measurements in every fourth row and column: all, below and above the depth range.
+        rows: Per frame: timestamp, state, total and reading time, stages, ms.
+        unreadable: A sentence per unusable frame.
+        checks: Figure and limit of all checks (``core/tracking/checks.py``).
+        repeated: Repeating frames by the repeated part.
+        rejected: Frames rejected for a fault of the stream, by kind; readable ones are lost as well.
+        mask_ious: Intersection over union of the mask, per frame with enough true coverage.
+        movers: Lines of movers.jsonl.
+        residuals: (BINS,) histogram of normalised residuals (``dynamics.masks``), or 0.
+        readings: Measurements in every fourth row and column: all, below and above the depth range.
         depth_limits: Used depths, metres.
         counts: Numbers of frames by kind.
-        spent: Seconds, and seconds of processor time, of the run before this process or pass.
+        spent: Seconds, and processor seconds, before this process or pass.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -69,12 +68,12 @@ class RunRecord:
     )
 
     def elapsed(self) -> tuple[float, float]:
-        """Seconds, and processor seconds, since the run began, without gaps between its processes."""
+        """Seconds, and processor seconds, without gaps between processes."""
         (wall, cpu), (wall_since, cpu_since) = self.spent, self._since
         return wall + time.perf_counter() - wall_since, cpu + time.process_time() - cpu_since
 
     def settle(self) -> None:
-        """Record the time so far; a continued run adds to it."""
+        """Record the time so far."""
         self.spent, self._since = self.elapsed(), (time.perf_counter(), time.process_time())
 
     def add(
@@ -85,10 +84,9 @@ class RunRecord:
         mask: NDArray[np.bool_] | None,
         **delays: float,
     ) -> None:
-        """Add one processed frame with its times (ms) and its true dynamic mask (H, W), if known.
+        """Add a frame with its times (ms) and true mask (H, W), if known.
 
-        In a live run ``delays`` are the number of frames ``dropped`` before this one, the ``latency`` from its arrival
-        to the result, ms, and the omitted work (``shed``).
+        Live ``delays``: frames ``dropped`` before, ``latency`` from arrival to result, ms, and ``shed``.
         """
         frame = {"timestamp": f"{result.timestamp:.6f}", "state": str(result.status)}
         times = {"reading": reading_ms, "total": total_ms} | delays | result.timings
@@ -118,7 +116,7 @@ class RunRecord:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
     def add_readings(self, frame: "Frame") -> None:
-        """Count the measurements of a frame, those outside of the depth range, and frames without colour."""
+        """Count measurements in and outside the depth range, and frames without colour."""
         depth = frame.depth
         self.counts["colorless"] += frame.color is None
         least, largest = self.depth_limits
@@ -128,10 +126,7 @@ class RunRecord:
         self.readings["too_far"] += int(np.count_nonzero(some > largest))
 
     def add_movers(self, row: dict[str, Any], result: FrameResult) -> None:
-        """Add the moving objects of a frame to its row of ``rows``, in the order of the frames.
-
-        Another thread may add later frames meanwhile.
-        """
+        """Add moving objects to a row of ``rows``, in order; another thread may add later frames."""
         start, movers = time.perf_counter(), result.movers
         if movers:
             line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in movers]}
@@ -147,11 +142,11 @@ class RunRecord:
         self.rejected[kind] = self.rejected.get(kind, 0) + 1
 
     def save_timings(self, path: Path) -> None:
-        """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
+        """Write a CSV row per frame, a column per stage, milliseconds."""
         _write_table(path, self.rows, "0")
 
     def save_checks(self, path: Path) -> None:
-        """Write a CSV file with one row per registered frame; unknown figures and limits are empty."""
+        """Write a CSV row per registered frame; unknown values are empty."""
         _write_table(path, self.checks, "")
 
     def save_movers(self, path: Path) -> None:
@@ -159,10 +154,10 @@ class RunRecord:
         write_text(path, "".join(f"{line}\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:
-        """Write an NPZ file with the histogram of all residuals and its fitted mixture, if there are any.
+        """Write an NPZ file with the histogram of all residuals and its mixture, if any.
 
-        Arrays: ``edges`` (BINS + 1,) in standard deviations of a measurement, ``counts`` (BINS,), ``prior`` (2,) and
-        ``sigma`` (2,) of the static and dynamic half-normal density (thesis eq. 4.56).
+        Arrays: ``edges`` (BINS + 1,), standard deviations, ``counts`` (BINS,), ``prior`` (2,) and ``sigma`` (2,),
+        static and dynamic (thesis eq. 4.56).
         """
         from dudmap.core.backends.cpu.evidence import EDGES
         from dudmap.core.dynamics.masks import fit_mixture
@@ -174,7 +169,7 @@ class RunRecord:
             np.savez(file, edges=EDGES, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
-        """Counts and times of all frames, under the keys of metrics.json."""
+        """Counts and times under the keys of metrics.json."""
         totals, readings, shares = (self._column(name) for name in ("total", "reading", "dynamic_share"))
         out: dict[str, Any] = {
             "frames": len(self.rows) + len(self.unreadable),
@@ -225,8 +220,6 @@ def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
 
 
 def _columns(result: FrameResult) -> dict[str, Any]:
-    """Figure and limit of each check by column, the failed checks, the evidence that overruled others, and standard
-    deviations of the pose."""
     verdict, covariance = result.verdict, result.covariance
     figures = dict[str, float]()
     if covariance is not None:

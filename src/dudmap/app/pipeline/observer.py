@@ -1,4 +1,4 @@
-"""Observers of a run: the base class of viewers, the log of events, and the crash report."""
+"""Observers of a run: base class, log of events, crash report."""
 
 import json
 import platform
@@ -21,49 +21,46 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
 
 RECENT = 50
-"""Events kept in memory: a second or two, mostly frames."""
+"""Events kept in memory: a second or two."""
 
 
 class RunObserver:
-    """Observer of a run; this one does nothing.
-
-    All methods are called in the thread of the run, between two frames, when nothing changes the map.
+    """Observer of a run that does nothing; its methods run between frames, in the run's thread.
 
     Attributes:
-        in_background: Whether ``frame`` may be called in another thread, in order, while later frames are processed.
-            Such observers must not read the map.
+        in_background: Whether another thread may call ``frame``, in order and without access to the map.
     """
 
     in_background = False
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """A pass over ``count`` frames (None: unknown) begins with this system; its run folder exists and is empty."""
+        """A pass over ``count`` frames (None: unknown) begins; its run folder is empty."""
 
     def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
-        """An interrupted pass continues at frame number ``first``; by default as if it began."""
+        """An interrupted pass continues at frame ``first``."""
         self.start(slam, out, count)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """Frame number ``index`` was read and processed in ``ms`` milliseconds."""
+        """Frame ``index`` was processed in ``ms`` milliseconds."""
 
     def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
-        """Another event occurred, such as an unreadable frame."""
+        """Another event, such as an unreadable frame."""
 
     def finish(self, out: Path) -> None:
-        """The run is over, possibly by an error or an interrupt, and its run folder is written."""
+        """The run is over, possibly by an error, and its folder is written."""
 
 
 class EventLog(RunObserver):
-    """Writes one JSON object per line and event, before the next frame begins.
+    """Writes one line of JSON per event, before the next frame.
 
-    Every object has ``time`` (seconds since 1970) and ``event``; docs/reliability.md lists the events and their keys.
+    Objects have ``time`` (seconds since 1970) and ``event``; docs/reliability.md lists them.
 
     Args:
-        path: The file, which is replaced; None only keeps the last events.
+        path: Replaced file; None keeps the last events only.
 
     Attributes:
         recent: The last ``RECENT`` events.
-        out: The run folder, None before a run has begun.
+        out: The run folder, None before a run.
 
     Raises:
         DudmapError: The file cannot be written.
@@ -85,7 +82,7 @@ class EventLog(RunObserver):
         self.event("start", folder=str(out), frames=count)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
-        """Write one event for the frame's state, and one for each special event of the frame."""
+        """Write events of the frame's state and special events."""
         assert self._slam is not None
         place: dict[str, Any] = {"frame": index, "timestamp": result.timestamp}
         figures = {"ms": round(ms, 2), "dynamic_share": round(float(result.dynamic_share), 4), "submap": result.submap}
@@ -123,7 +120,7 @@ class EventLog(RunObserver):
 
 
 def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, Any]] = ()) -> InternalError:
-    """Write ``crash-<date>.txt`` with the last events into a folder; return the error that names it."""
+    """Write ``crash-<date>.txt`` with the last events; return the error that names it."""
     path = folder / f"crash-{time.strftime('%Y%m%d-%H%M%S')}.txt"
     what = f"{type(error).__name__}: {error}"
     try:
@@ -148,7 +145,7 @@ def report_text(error: BaseException, events: Iterable[dict[str, Any]]) -> str:
 
 
 def command_line() -> str:
-    """The command line of this process, without the secret of ``--token``."""
+    """This process' command line without the secret of ``--token``."""
     program, *arguments = sys.argv
     program = "dudmap" if Path(program).name == "__main__.py" else Path(program).name
     return re.sub(r"(--token[= ])\S+", r"\1...", shlex.join([program, *arguments]))

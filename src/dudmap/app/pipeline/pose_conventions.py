@@ -1,4 +1,4 @@
-"""Conventions of poses, and a test which convention fits the depth images."""
+"""Conventions of poses, and a test which fits the images."""
 
 from itertools import product
 from typing import TYPE_CHECKING, NamedTuple
@@ -18,7 +18,7 @@ AXES = {
     "opengl": np.diag([1.0, -1, -1, 1]),
     "ros": np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]),
 }
-"""Camera axes (x right, y up, z back; x forward, y left, z up) in the axes used here."""
+"""Camera axes (x right, y up, z back; x forward, y left, z up) in dudmap's."""
 WORDS = {
     "world-to-camera": "inverse poses",
     "opengl": "camera x right, y up, z back",
@@ -26,27 +26,27 @@ WORDS = {
     "wxyz": "quaternions with w in the other place",
     "millimetres": "positions in millimetres",
 }
-"""Words of ``--poses-as`` by their difference from the default."""
+"""Words of ``--poses-as``."""
 PAIRS = 12
 TURN, STEP = 8.0, 0.15
-"""Least motion between the images of a pair, degrees or metres: far more than odometry noise."""
+"""Least motion of a pair, degrees or metres."""
 FURTHEST = 90
-"""Largest number of frames between the images of a pair."""
+"""Largest number of frames between a pair."""
 FARTHEST = 50.0
-"""Extent of the positions in metres beyond which they may be millimetres: a desk would be 500 wide."""
+"""Extent of positions, metres, beyond which they may be millimetres."""
 STRIDE = 6
 TOLERANCE = 0.03
-"""Largest difference of depths that agree, metres at 1 m and in proportion beyond."""
+"""Difference of agreeing depths, metres at 1 m and in proportion."""
 CLEARLY = 0.12
-"""Mean share of the pixels by which another convention must fit better: three times its spread."""
+"""Mean share of pixels by which another convention fits better: three times its spread."""
 MOSTLY = 0.8
-"""Share of the pairs in which the other convention must fit better."""
+"""Share of pairs that it fits better."""
 HARDLY = 0.15
-"""Smallest share of pixels with agreeing depth of poses that belong to the images."""
+"""Smallest share of agreeing pixels of poses that belong to the images."""
 
 
 class Convention(NamedTuple):
-    """Convention of poses; the names are keys of ``WORDS``."""
+    """Convention of poses by keys of ``WORDS``."""
 
     inverse: bool = False
     axes: str = ""
@@ -58,7 +58,7 @@ class Convention(NamedTuple):
         return ",".join(name for name, used in (*words, ("millimetres", self.millimetres)) if used)
 
     def poses(self, Ts: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses (N, 4, 4) that were read as camera-to-world, in the convention used here."""
+        """Poses (N, 4, 4), read as camera-to-world, in dudmap's convention."""
         Ts = Ts.copy()
         if self.wxyz:
             quats = [np.roll(se3.rotation_to_quat_xyzw(R), -1) for R in Ts[:, :3, :3]]
@@ -77,7 +77,7 @@ def named(words: list[str]) -> Convention:
     """The convention of words of ``--poses-as``.
 
     Raises:
-        ConfigError: A word is unknown, or there are axes of two kinds.
+        ConfigError: An unknown word, or two kinds of axes.
     """
     axes = [word for word in words if word in AXES]
     if set(words) - set(WORDS) or len(axes) > 1:
@@ -88,15 +88,15 @@ def named(words: list[str]) -> Convention:
 
 
 def converted(poses: Trajectory, convention: Convention) -> Trajectory:
-    """Poses that were read as camera-to-world, in the convention used here."""
+    """Poses, read as camera-to-world, in dudmap's convention."""
     return Trajectory(poses.timestamps, convention.poses(poses.Ts_world_camera), poses.remarks)
 
 
 def check_convention(poses: Trajectory, sequence: "Sequence", name: str, read_as: Convention) -> None:
-    """Compare the depth images of pairs of frames by their poses, read in every convention.
+    """Compare depth images of pairs of frames by poses in every convention.
 
     Raises:
-        DatasetError: Another convention fits the images clearly better, or the poses hardly fit at all.
+        DatasetError: Another convention fits clearly better, or the poses hardly fit.
     """
     number_of = {float(stamp): number for number, stamp in enumerate(sequence.timestamps)}
     suspected = bool(np.ptp(poses.Ts_world_camera[:, :3, 3], axis=0).max() > FARTHEST)
@@ -151,7 +151,6 @@ def _pairs(poses: Trajectory) -> list[tuple[int, int]]:
 
 
 def _agreeing(depth: NDArray, other: NDArray, T_camera_other: NDArray[np.float64], camera: "Camera") -> float:
-    """Share of the measurements in another image (H, W) that a depth image (H, W) confirms at their relative pose."""
     v, u = np.mgrid[0 : camera.height : STRIDE, 0 : camera.width : STRIDE].reshape(2, -1)
     z = other[v, u].astype(np.float64)
     u, v, z = u[z > 0], v[z > 0], z[z > 0]

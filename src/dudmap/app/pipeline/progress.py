@@ -44,9 +44,9 @@ NOT_FUSED = {
 
 
 class RunProgress:
-    """Progress bar on stderr, if it is a terminal, with frame number, frames per second, dynamic share and state.
+    """Progress bar on a terminal's stderr: number, rate, dynamic share, state.
 
-    Lost and unreadable frames are logged once per gap, even without the bar. ``total`` is None if unknown.
+    Lost and unreadable frames are logged once per gap, in any case. ``total`` is None if unknown.
     """
 
     def __init__(self, total: int | None, *, bar: bool = True) -> None:
@@ -75,8 +75,7 @@ class RunProgress:
         self._bar.stop()
 
     def frame(self, index: int, result: "FrameResult", dropped: int | None = None, shed: str = "") -> None:
-        """Show a processed frame, the number of frames that a live run has dropped so far, and the work that it
-        omits."""
+        """Show a frame, the frames dropped so far, and omitted work."""
         if self._skipped > 1:
             log.info("frame %d: readable again, %d skipped", index, self._skipped)
         self._skipped = 0
@@ -103,24 +102,24 @@ class RunProgress:
         )
 
     def skip(self, error: "FrameError") -> None:
-        """Report the first of consecutive frames that cannot be read or used."""
+        """Report the first of consecutive unusable frames."""
         if self._skipped == 0:
             log.warning("skipped: %s", error)
         self._skipped += 1
 
     def announce_compilation(self) -> None:
-        """Log that kernels are compiled first, if none is cached or part of the installation."""
+        """Log that kernels are compiled first, if none exists."""
         if kernel_cache.is_cold():
             log.info(COMPILING)
 
     def once(self, sentence: str) -> None:
-        """Log a warning unless it was logged before."""
+        """Log a warning once."""
         if sentence not in self._said:
             self._said.add(sentence)
             log.warning(sentence)
 
     def working(self, what: str) -> None:
-        """Show an activity other than the processing of a frame."""
+        """Show another activity."""
         self._bar.update(self._task, state=what)
 
 
@@ -147,7 +146,7 @@ def summary(metrics: dict[str, Any]) -> Table:
 
 
 def outcome(metrics: dict[str, Any], out: Path) -> str:
-    """Last line of a run: the folder, how complete and accurate it is, and the command that shows it."""
+    """Last line of a run: folder, completeness, accuracy, and the command to show it."""
     found = [f"the poses of {metrics['tracked'] + metrics['repeated']} of {metrics['frames']} frames"]
     if triangles := metrics["mesh_triangles"]:
         found.append(f"a mesh of {triangles} triangles")

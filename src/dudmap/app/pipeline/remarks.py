@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def remarks(slam: "Slam", record: RunRecord) -> Iterator[str]:
-    """Sentences on skipped frames, and on maps that could not be joined."""
+    """Sentences on skipped frames and separate maps."""
     if len(slam.maps) > 1:
         yield _unmerged_submaps(slam)
     if record.repeated:

@@ -1,4 +1,4 @@
-"""Continue an interrupted run from the state in its folder."""
+"""Continue an interrupted run from its folder."""
 
 import logging
 import sqlite3
@@ -31,18 +31,15 @@ def resume(
     progress: bool = True,
     observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
-    """Continue a killed or interrupted run from its last checkpoint to the end.
-
-    Recording, configuration and options are those of the interrupted run. Poses, masks, map and mesh are bit-identical
-    to a run without interruption. A run that ended during the calibration of the colour camera starts again.
+    """Continue an interrupted run from its last checkpoint, bit-identically, with its recording, configuration and
+    options.
 
     Args:
         sequence: The recording; None opens the recording of the run.
-        device: Another device to continue on; the results then differ by rounding.
+        device: Other device; results differ by rounding.
 
     Raises:
-        StateError: The folder has no state, the run is finished, its recording has changed, or the state is damaged or
-            of another version.
+        StateError: No state, a finished run, a changed recording, or a damaged or foreign state.
         DudmapError: As for ``run``; or another process writes into the folder.
     """
     from dudmap.app.viewing.report import ReportObserver

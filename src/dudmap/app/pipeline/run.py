@@ -1,4 +1,4 @@
-"""Process a recording or a camera: read frames, run the system, record metrics, write the run folder."""
+"""Process a recording or a camera and write the run folder."""
 
 import logging
 from collections.abc import Generator, Iterable, Iterator
@@ -70,50 +70,46 @@ def run(
     storing: Storing | None = None,
     warnings: Iterable[str] = (),
 ) -> RunReport:
-    """Run the system over a recording, or on a camera until its stream ends or Ctrl-C, and write a run folder.
+    """Run the system over a recording, or a camera until its end or Ctrl-C, and write a run folder (``docs/files.md``).
 
-    ``docs/files.md`` describes the files: trajectory.txt, mesh.ply, map.npz, metrics.json and others. Results of an
-    earlier run are removed first. An interrupted or failed run writes the results so far. With ``storing`` the folder
-    also holds state.db until the run is finished; ``dudmap.app.pipeline.resume.resume`` continues from it.
+    Earlier results are removed first; an interrupted or failed run writes its results so far. With ``storing`` the
+    folder holds state.db until the end, for ``dudmap.app.pipeline.resume.resume``.
 
     Args:
-        sequence: The recording, whose ground truth and masks are used for evaluation only; or a camera, which is closed
-            at the end. Frames of a camera wait for at most 0.1 s; older ones are counted as ``dropped``.
+        sequence: Recording (its ground truth and masks are for evaluation only) or camera, closed at the end. Camera
+            frames wait for at most 0.1 s; older ones are ``dropped``.
         config: All parameters.
-        out: The run folder; created if needed.
-        max_frames: Process only this many frames.
-        save_masks: Write the dynamic mask of every frame.
+        out: The run folder, created if needed.
+        max_frames: Limit.
+        save_masks: Write all dynamic masks.
         save_map: Write map.npz and keyframes.npz.
-        masks: Folder of external dynamic masks (255 = dynamic), added to the estimated ones. They are named like the
-            images or <timestamp>.png.
-        ignore: Image, white at pixels of the depth or colour image that are never used; ignored.png is its copy.
+        masks: Folder of external masks (255 = dynamic), added to the estimated ones; named like the images or
+            <timestamp>.png.
+        ignore: Image, white at pixels that are never used; ignored.png is its copy.
         progress: Show a progress bar on a terminal.
-        ahead: Number of frames read ahead, without effect on the result. Use 0 for rendered frames, because rendering
-            uses all cores and would distort the times.
+        ahead: Frames read ahead, without effect on the result; 0 for rendered frames, which use all cores.
         live: Replay the recording as if it were a camera.
-        record: MCAP file for all frames of a camera that arrive, processed or not.
-        passes: 2 processes the recording twice. The second pass compares every frame with the final map of the first,
-            so that objects in view from the start also leave the map. The last complete pass is written.
-        poses: Poses of the frames: the result, or the start of registration; given_poses.txt is their copy. If they are
-            the result, frames without a pose are skipped.
-        calibration: Of the colour camera; None takes the calibration of the recording or the camera.
-        calibrate: Estimate the calibration from the start of the recording first.
-        saved_map: Map of an earlier run to continue; it is modified. All poses are in its world frame.
-        localize: Only find the camera in ``saved_map``; no map and no mesh is written.
-        max_memory: Largest resident memory of the process, bytes. Distant parts of the map wait on disk, without effect
-            on the result. None keeps the whole map in memory.
-        observers: Observers of every pass, every processed frame, and the written run folder.
-        storing: Store the state of the run at checkpoints; None does not. A live replay cannot be stored.
-        warnings: Sentences on suspected faults of the recording (``pipeline.inspection``), for metrics.json.
+        record: MCAP file for all arriving frames.
+        passes: 2 processes the recording twice, so that objects in view from the start also leave the map. The last
+            complete pass is written.
+        poses: Result, or start of registration; given_poses.txt is their copy. As result, frames without a pose are
+            skipped.
+        calibration: Of the colour camera; None takes the recording's or camera's.
+        calibrate: Estimate it from the start of the recording first.
+        saved_map: Map to continue, which is modified and gives the world frame.
+        localize: Only find the camera in ``saved_map``, without map and mesh.
+        max_memory: Resident memory, bytes; distant map parts wait on disk. None keeps all.
+        observers: Of passes, frames, and the written folder.
+        storing: Checkpoints; None for none; not with ``live``.
+        warnings: Suspected faults of the recording (``pipeline.inspection``), for metrics.json.
 
     Raises:
-        ConfigError: ``passes`` is not 1 or 2, or it is 2 with a camera or ``saved_map``. ``localize`` lacks a
-            ``saved_map``. ``storing`` is used with a camera. The configured system lacks an option.
+        ConfigError: ``passes`` is not 1 or 2, or 2 with a camera or ``saved_map``; ``localize`` without ``saved_map``;
+            ``storing`` with a camera; the system lacks an option.
         CameraError: The camera stopped delivering frames, after writing; or the recording cannot be written.
-        DudmapError: The folder cannot be written, lies in the recording, or is in use by another process. The recording
-            cannot be used, or no frame could be tracked.
-        KeyboardInterrupt: Ctrl-C, after writing, unless it ends the stream of a camera; the message names the saved
-            files.
+        DudmapError: The folder cannot be written, lies in the recording, or is in use. The recording cannot be used, or
+            no frame was tracked.
+        KeyboardInterrupt: Ctrl-C, after writing, unless it ends a camera's stream; it names the files.
     """
     from dudmap.app.pipeline.calibration import calibrate_start
 
@@ -202,7 +198,7 @@ def run(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A run with its options; for the attributes see ``run``."""
+    """A run with its options, see ``run``."""
 
     sequence: "Sequence | LiveCamera"
     out: Path
@@ -242,12 +238,12 @@ class Job:
         )
 
     def restored(self, reader: StateReader, store: RunStore) -> RunState:
-        """Restore the run's state at the checkpoint in its database; ``store`` continues it."""
+        """Restore the run's state at the checkpoint; ``store`` continues it."""
         with TreeReader(reader, store.database) as tree:
             return RunState.read(tree, StoredRun.model_validate(reader.meta()), self.options.config.device)
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
-        """Process the remaining frames and write the run folder, which is locked; see ``run``."""
+        """Process the remaining frames and write the locked run folder."""
         out, display, stopped, defect = self.out, self.display, "", False
         with ExitStack() as files, display:
             try:
@@ -346,7 +342,7 @@ class Job:
             yield state, store
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
-        """Write the run folder; delete the stored state unless the run was stopped."""
+        """Write the run folder; delete the state unless stopped."""
         self.display.working("writing")
         slam, record = state.slam, state.record
         if stopped and state.number:  # the first pass is complete, the second is not

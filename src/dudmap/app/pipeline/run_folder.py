@@ -1,4 +1,4 @@
-"""The run folder: its lock, creation, cleaning and writing of all result files."""
+"""The run folder: lock, cleaning, and all result files."""
 
 import json
 import os
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 LOCK = ".lock"
 LOCKED_BYTE = 1 << 20
-"""Position of the locked byte on Windows, behind the text that others read."""
+"""Locked byte on Windows, behind the text."""
 
 FILES = (
     "trajectory.txt", "image_poses.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json",
@@ -49,7 +49,7 @@ FILES = (
 )  # fmt: skip
 IGNORED = "ignored.png"
 FACES = 20_000
-"""Most triangles for the direction against gravity: a tenth of a second."""
+"""Triangles for the direction against gravity: a tenth of a second."""
 SCORES = (
     "evaluation.json", "evaluation.md", "evaluation.csv", "evaluation.tex", "mesh.evaluation.json",
     "masks.evaluation.json", "timings.evaluation.json", "timings.tex", "trajectory.png", "error.png", "path.png",
@@ -62,16 +62,16 @@ WRITTEN = {
     "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
     "images": r"-?\d+\.\d{6}\.(jpg|png)|(associations|intrinsics)\.txt",
 }  # fmt: skip
-"""Regular expressions of all file names of a run, by sub-folder."""
+"""File names of a run by sub-folder, regular expressions."""
 
 
 @contextmanager
 def run_lock(folder: Path) -> Iterator[None]:
-    """Hold the lock of an existing run folder; the operating system releases it when the process ends.
+    """Hold the lock of a run folder, at most until the process ends.
 
     Raises:
-        DudmapError: Another process, or another run of this one, holds the lock; the message names it.
-        OSError: The file cannot be written, or is a link or anything but a plain file.
+        DudmapError: Another holds the lock; the message names it.
+        OSError: The file cannot be written or is no plain file.
     """
     with OwnFolder(folder, linked=True) as own, _locked_file(own) as file:
         about = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(" ", "seconds")}
@@ -126,10 +126,7 @@ def _described(holder: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RunReport:
-    """Result of a run.
-
-    Attributes:
-    """
+    """Result of a run."""
 
     out: Path
     metrics: dict[str, Any]
@@ -137,18 +134,16 @@ class RunReport:
 
 
 def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """Write a mask (H, W) as an image, 255 = dynamic; it reaches the disk before the next checkpoint."""
+    """Write a mask (H, W), 255 = dynamic, on disk before the next checkpoint."""
     write_image(path, mask, sync=False, own=True)
 
 
 @contextmanager
 def locked(out: Path) -> Iterator[None]:
-    """Lock the run folder against other processes; create it if needed.
-
-    Half-written files of a killed process are removed.
+    """Lock the run folder; create it if needed and remove half-written files.
 
     Raises:
-        DudmapError: Another process writes into the folder, or it cannot be created or written.
+        DudmapError: Another process writes, or the folder cannot be created or written.
     """
     with ExitStack() as held:
         with writing(f"into the run folder {out}"):
@@ -159,10 +154,10 @@ def locked(out: Path) -> Iterator[None]:
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
-    """Remove the results of an earlier run from the run folder, which is ``locked``.
+    """Remove earlier results from the ``locked`` run folder.
 
     Raises:
-        DudmapError: The folder cannot be written, or holds a recording or the masks to be read.
+        DudmapError: It cannot be written, or holds the recording or masks to read.
     """
     if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or is_recording(out):
         raise DudmapError(
@@ -188,13 +183,12 @@ def write_run_folder(
     defect: bool = False,
     poses: "GivenPoses | None" = None,
 ) -> RunReport:
-    """Write all files of the run folder; a file that fails does not prevent the others.
+    """Write all files of the run folder, in spite of failing ones.
 
-    After a defect of dudmap, files that cannot be written are listed under ``not_written`` in metrics.json, so that the
-    first error is reported.
+    After a defect of dudmap, metrics.json lists them under ``not_written``, so that the first error is reported.
 
     Raises:
-        DudmapError: A file could not be written, other than after a defect.
+        DudmapError: A file failed, other than after a defect.
     """
     foreseen = Exception if defect else (OSError, MapError)
     calibration, maps = slam.calibration, slam.maps

@@ -1,16 +1,16 @@
-"""Omit work in a live run whose frames take longer than the period of the sensor."""
+"""Omit work in a live run of slow frames."""
 
 from dudmap.core.shed import Shed
 
 SPAN = 5
-"""Time constant of the mean processing time, and fewest frames between two steps. At 30 frames per second the queue
-holds three frames (``MAX_WAIT``): frames that take 1.6 periods fill it in this time."""
+"""Time constant of the mean processing time, and fewest frames between steps: frames of 1.6 periods fill the queue
+(``MAX_WAIT``)."""
 PERIOD_SPAN = 30
-"""Time constant of the mean period, frames: images of a camera may arrive in bursts."""
+"""Time constant of the mean period, frames."""
 HIGH, LOW = 1.0, 0.7
-"""Mean processing time above which more work is omitted, and below which less is, periods of the sensor."""
+"""Mean processing time, periods, above which more work is omitted, and below which less is."""
 CALM = 15
-"""Number of frames below ``LOW`` until less work is omitted."""
+"""Frames below ``LOW`` before less work is omitted."""
 SAID = {
     Shed.NOTHING: "",
     Shed.MOVERS: "without moving objects",
@@ -21,7 +21,7 @@ SAID = {
 
 
 class Shedding:
-    """Chooses the omitted work from the times of the frames.
+    """Chooses the omitted work by the times of frames.
 
     Attributes:
         step: Omitted work.
@@ -34,7 +34,7 @@ class Shedding:
         self._last: tuple[int, float] | None = None
 
     def add(self, number: int, arrival: float, busy: float) -> None:
-        """Add a processed frame: its number in the stream, its time of arrival and its processing time, seconds."""
+        """Add a frame: number in the stream, arrival and processing time, seconds."""
         last, self._last = self._last, (number, arrival)
         if last is not None:
             self._periods += 1

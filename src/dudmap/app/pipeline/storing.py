@@ -1,4 +1,4 @@
-"""Store the state of a run in its folder, at checkpoints, and read it to continue the run."""
+"""Checkpoints of a run in its folder."""
 
 import os
 import re
@@ -46,10 +46,9 @@ if TYPE_CHECKING:
 DATABASE = "state.db"
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
 SHARE = 0.02
-"""Largest share of elapsed time that checkpoints take in processor time. The rest of the allowed 3 % is for memory
-bandwidth and caches, which is not measured."""
+"""Processor time of checkpoints, share of elapsed time; bandwidth and caches take the rest of 3 %."""
 FIRST = 5.0
-"""Seconds before the first checkpoint; repeating a shorter run takes no longer."""
+"""Seconds before the first checkpoint."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ class Storing:
     """How a run is stored.
 
     Attributes:
-        every: Seconds between checkpoints; None chooses by their cost.
+        every: Seconds between checkpoints; None: by cost.
     """
 
     recording: dict[str, Any]
@@ -86,10 +85,7 @@ class RunOptions(BaseModel):
 
 
 class StoredRun(BaseModel):
-    """Description of a run in its database.
-
-    Attributes:
-    """
+    """Description of a run in its database."""
 
     options: RunOptions
     recording: str
@@ -103,7 +99,7 @@ class RunState:
     """State of a run.
 
     Attributes:
-        number: Number of the pass, from 0.
+        number: Of the pass, from 0.
     """
 
     slam: "Slam"
@@ -114,7 +110,7 @@ class RunState:
     first_record: RunRecord | None = None
 
     def parts(self) -> dict[str, object]:
-        """Parts of the stored state; the numbers are in its ``StoredRun``."""
+        """Parts of the stored state."""
         figures = {"record": self.record, "calibration": self.calibration, "first record": self.first_record}
         return parts_of(self.slam) | figures
 
@@ -132,14 +128,13 @@ class RunState:
 
 
 class RunStore:
-    """Stores the state of a run in its folder: checkpoints between two frames, written by a background thread.
+    """Stores checkpoints between frames in a background thread.
 
-    If a checkpoint cannot be written, this is reported once and tried again at the next one. The database then keeps
-    its content.
+    A failed checkpoint is reported once; the database keeps its content until the next.
 
     Args:
-        every: Seconds between checkpoints; None chooses by their cost.
-        notice: Receives messages on failed checkpoints.
+        every: Seconds between checkpoints; None: by cost.
+        notice: Receives messages on failures.
 
     Raises:
         DudmapError: The database cannot be created.
@@ -160,7 +155,7 @@ class RunStore:
         self._failing = False
 
     def order(self, sequence: "Sequence", options: RunOptions) -> None:
-        """Store the arguments of the run, before anything that takes time."""
+        """Store the arguments of the run."""
         about = {"options": options.model_dump(mode="json"), "recording": recording_fingerprint(sequence)}
         about |= {"code": code_fingerprint(), "versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
         try:
@@ -169,7 +164,7 @@ class RunStore:
             raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
 
     def frame(self, state: RunState, frame: "Frame | Exception", background: Background) -> None:
-        """Take a checkpoint after a processed frame if one is due, once all background jobs are done."""
+        """Take a due checkpoint once all background jobs are done."""
         if not isinstance(frame, Exception):
             self._files.append(self._out / "masks" / f"{frame.timestamp:.6f}.png")
         if self.is_due:
@@ -177,13 +172,13 @@ class RunStore:
             self.take(state, images_fingerprint(frame))
 
     def end(self, state: RunState) -> None:
-        """Store the last state before the results are written, unless the run was short."""
+        """Store the last state, unless the run was short."""
         if self._every is not None or self.written or time.perf_counter() - self._start >= FIRST:
             self.take(state, wait=True)
 
     @property
     def is_due(self) -> bool:
-        """Whether a checkpoint is due and the last one is written."""
+        """Whether a checkpoint is due and the last is written."""
         if self._running is not None and not self._running.done():
             return False
         self._finish()
@@ -193,10 +188,8 @@ class RunStore:
         return now - self._last >= FIRST and self._cost + self._last_cost <= SHARE * (now - self._start)
 
     def take(self, state: RunState, frame: str = "", *, wait: bool = False) -> None:
-        """Take a snapshot of the state and have it written; ``frame`` is the fingerprint of the last frame.
-
-        During background computations it does nothing; with ``wait`` it waits for them and for the file.
-        """
+        """Have a snapshot of the state written; with ``wait`` after background computations, else not during them.
+        ``frame``: fingerprint of the last frame."""
         if wait:
             self._finish()
         start, busy = time.perf_counter(), time.thread_time()
@@ -264,7 +257,7 @@ class RunStore:
 
 
 def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
-    """Open the database of an unfinished run; return it with the description of the run.
+    """Open the database of an unfinished run, with the run's description.
 
     Raises:
         StateError: There is none, the run is finished, or another version wrote it.
@@ -285,7 +278,7 @@ def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
 
 
 def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
-    """Check that a recording is the one of a stored run."""
+    """Check the recording of a stored run."""
     same = recording_fingerprint(sequence) == stored.recording
     if not same or (stored.frame and frame_fingerprint(sequence, stored.next - 1) != stored.frame):
         raise StateError(

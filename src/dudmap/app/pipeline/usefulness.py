@@ -1,4 +1,4 @@
-"""Tests whether a run is of use; otherwise names the cause and a remedy."""
+"""Whether a run is of use; else cause and remedy."""
 
 import re
 from collections import Counter
@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 LEAST_SHARE = 0.1
-"""Smallest share of the frames in the largest map of a useful run."""
+"""Smallest share of frames in the largest map."""
 MOST = 0.5
-"""Share of the measurements outside of the depth range that explains a useless run."""
+"""Share of measurements outside the depth range that explains failure."""
 
 
 def uselessness(metrics: Mapping[str, Any], poses: int, depth_range: tuple[float, float]) -> str | None:
-    """Sentence on a run with hardly any frame in the largest map (``poses``) or no triangle in the mesh; else None."""
+    """Sentence on a run with hardly any frame in the largest map (``poses``) or no triangle, or None."""
     frames = metrics["frames"]
     if poses < LEAST_SHARE * frames:
         found = f"{poses} of {frames} frames are in its largest map"

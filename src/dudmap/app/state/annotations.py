@@ -1,4 +1,4 @@
-"""Interpret annotations of attributes: how values are stored, and which values may be created from them."""
+"""Interpret annotations of attributes: storage and allowed values."""
 
 import types
 from collections.abc import Callable, Iterable
@@ -19,9 +19,8 @@ RECORD = dict[str, Any]
 
 @cache
 def content_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:  # noqa: ANN401
-    """Class and arguments of an annotation; ``object`` for plain values.
-
-    Of a union, the one member counts that is neither None nor plain.
+    """Class and arguments of an annotation; ``object`` for plain values; of a union, the member that is neither None
+    nor plain.
 
     Raises:
         TypeError: There are several such members, or the annotation is ``Any``.
@@ -43,7 +42,7 @@ def content_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:  # noqa: ANN401
 
 @cache
 def fields_of(cls: type) -> dict[str, Any]:
-    """Annotations of the fields of a dataclass or named tuple by name, without caches; empty for other classes."""
+    """Annotations of the fields of a dataclass or named tuple, without caches; empty for others."""
     if issubclass(cls, tuple):
         names: Iterable[str] = getattr(cls, "_fields", ())
     else:
@@ -71,7 +70,7 @@ def item_hints(kind: Any, parts: tuple[Any, ...], count: int) -> list[Any]:  # n
 
 
 def fits(value: Any, hint: Any) -> bool:  # noqa: ANN401
-    """Whether a value fits an annotation; items of containers are checked when they are created."""
+    """Whether a value fits an annotation, without items of containers."""
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, types.UnionType):
         return any(fits(value, part) for part in parts)

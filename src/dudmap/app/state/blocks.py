@@ -15,7 +15,7 @@ from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords
 from dudmap.core.places.frame_store import EncodedFrame, FrameStore
 
 VOXELS = 2 * BLOCK**3
-"""32-bit words of a block: geometry of its voxels, then colours."""
+"""32-bit words of a block: geometry, then colours."""
 
 
 class MapSettings(NamedTuple):
@@ -36,7 +36,7 @@ class MapSettings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MapSnapshot:
-    """Changes of a map since the last checkpoint.
+    """Changes of a map since the last checkpoint: ``slots``, ``coords``, ``voxels`` (n,), (n, 3), (n, VOXELS) int32.
 
     Attributes:
         slots, coords, voxels: (n,), (n, 3), (n, VOXELS) int32 of the changed blocks.
@@ -55,7 +55,7 @@ class MapSnapshot:
 
 
 class StoredMap(NamedTuple):
-    """A map in the database: its number, the frame count at its last storing, its regions' content numbers."""
+    """A map in the database: number, frame count and content numbers of its regions at the last storing."""
 
     number: int
     frame: int
@@ -63,7 +63,7 @@ class StoredMap(NamedTuple):
 
 
 class StoredMaps:
-    """Tracks which blocks the database holds in their present state.
+    """Blocks that the database holds in their present state.
 
     Attributes:
         by_id: The maps in the database by ``TsdfVolume.map_id``.
@@ -74,7 +74,7 @@ class StoredMaps:
         self._next = 0  # number of the next new map
 
     def snapshot(self, volume: TsdfVolume) -> MapSnapshot:
-        """Copy the blocks of a map that the database lacks or holds in an earlier state."""
+        """Copy the blocks that the database lacks or holds in an earlier state."""
         stored, blocks = self.by_id.get(volume.map_id), volume.blocks
         number = self._next if stored is None else stored.number
         self._next = max(self._next, number + 1)
@@ -94,7 +94,7 @@ class StoredMaps:
         )  # fmt: skip
 
     def commit(self, maps: list[MapSnapshot]) -> None:
-        """Record that the database now holds the blocks of these maps, and no other maps."""
+        """Record that the database holds these maps only."""
         self.by_id = {changed.map_id: StoredMap(changed.number, changed.frame, changed.away) for changed in maps}
 
     def add(self, volume: TsdfVolume, number: int) -> None:
@@ -106,10 +106,7 @@ class StoredMaps:
 
 @dataclass(frozen=True, eq=False)
 class FrameSnapshot:
-    """Changes of a frame store since the last checkpoint.
-
-    Attributes:
-    """
+    """Changes of a frame store since the last checkpoint."""
 
     number: int
     frames: dict[int, EncodedFrame]
@@ -125,7 +122,7 @@ class StoredFrames:
         self._stores: list[tuple[FrameStore, set[int]]] = []  # indexed by store number
 
     def snapshot(self, store: FrameStore) -> FrameSnapshot:
-        """Frames that the database lacks, and frames that it no longer needs; waits until the former are encoded."""
+        """Frames that the database lacks, once encoded, and frames that it no longer needs."""
         number = next((n for n, (one, _) in enumerate(self._stores) if one is store), len(self._stores))
         if number == len(self._stores):
             self._stores.append((store, set()))
@@ -153,7 +150,7 @@ class Snapshot:
     """Immutable state of a system at one moment.
 
     Attributes:
-        arrays: Copies of arrays, constant arrays themselves, or lists of plain values.
+        arrays: Copies, constant arrays themselves, or lists of plain values.
     """
 
     tree: dict[str, Node] = field(default_factory=dict)

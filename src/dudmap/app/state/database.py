@@ -1,8 +1,7 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
-Tables: ``blocks`` (voxels by map and slot), ``regions`` (blocks that have left the memory), ``frames`` (stored frames),
-``chunks`` (parts of arrays by content), ``state`` (the tree), ``meta`` (description of the run). The write-ahead log
-makes a checkpoint complete or absent after a crash, and readable during writing.
+Tables: ``blocks`` (voxels by map and slot), ``regions`` (paged out), ``frames``, ``chunks`` (parts of arrays by
+content), ``state`` (the tree), ``meta``. The write-ahead log makes a checkpoint atomic, and readable during writing.
 """
 
 import hashlib
@@ -38,12 +37,11 @@ from dudmap.input_files import (
 from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
-"""Application number in the file header: the letters DUDS."""
+"""Application number of the file: DUDS."""
 SCHEMA = 6
 CHUNK = 1 << 16
-"""Bytes of an array per chunk; unchanged chunks are not written again."""
 STEPS, LIMIT = 10_000, 100_000
-"""SQLite instructions (10 to 50 per row) between two checks for ctrl-C, and checks until a statement is ended."""
+"""SQLite instructions between checks for ctrl-C, and checks until a statement is ended."""
 ROWS = 4096
 TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
@@ -60,13 +58,13 @@ CREATE TABLE frames (store INTEGER, number INTEGER, depth BLOB NOT NULL, color B
 
 
 class StateDatabase:
-    """Writes checkpoints. For one thread at a time.
+    """Writes checkpoints, from one thread at a time.
 
     Args:
-        path: The file; created with its tables if it does not exist.
+        path: Created with its tables if missing.
 
     Raises:
-        OSError: The file is a link or anything but a plain file.
+        OSError: The file is no plain file.
         sqlite3.Error: It cannot be created or opened.
     """
 
@@ -89,7 +87,7 @@ class StateDatabase:
         self._chunks = {row[0].hex() for row in self._execute("SELECT key FROM chunks")}
 
     def write_meta(self, values: dict[str, Any]) -> None:
-        """Set values that describe the run, all or none.
+        """Set values that describe the run, atomically.
 
         Raises:
             sqlite3.Error: They cannot be written.
@@ -98,10 +96,10 @@ class StateDatabase:
         self._connection.execute("INSERT OR REPLACE INTO meta SELECT key, value FROM json_each(?)", [rows])
 
     def write(self, snapshot: Snapshot, meta: dict[str, Any]) -> None:
-        """Store a snapshot taken with ``maps`` and ``frames``, as one transaction.
+        """Store a snapshot as one transaction.
 
         Raises:
-            sqlite3.Error: It cannot be written; the database keeps the previous checkpoint.
+            sqlite3.Error: It failed; the previous checkpoint stays.
         """
         arrays = [self._described(array, n in snapshot.constant) for n, array in enumerate(snapshot.arrays)]
         described = {"tree": snapshot.tree, "arrays": [one for one, _ in arrays]}
@@ -167,8 +165,7 @@ class StateDatabase:
             self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
 
     def _described(self, array: NDArray | list[Any], constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
-        """Type, shape and chunk keys of an array, and chunks that may be new; a list of plain values is stored as
-        lines of JSON."""
+        """Type, shape and chunk keys of an array, and chunks; plain lists as lines of JSON."""
         if isinstance(array, list):
             array = np.frombuffer("".join(json.dumps(record) + "\n" for record in array).encode(), np.uint8)
         transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
@@ -186,10 +183,10 @@ class StateDatabase:
 
 
 class StateReader:
-    """Reads one checkpoint from the database of a run, also during the run.
+    """Reads one checkpoint, also during the run.
 
     Raises:
-        StateError: The file is missing or of another version; all methods: it is damaged, or a row is missing.
+        StateError: The file is missing or foreign; all methods: damaged, or a row is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -246,7 +243,7 @@ class StateReader:
             raise self._damaged(error) from error
 
     def blocks(self, map_number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-        """Slots (n,), block coordinates (n, 3) and voxels (n, VOXELS) of the blocks of a map, by slot."""
+        """Slots (n,), block coordinates (n, 3) and voxels (n, VOXELS) of a map, by slot."""
         select = "SELECT slot, x, y, z, crc, voxels FROM blocks WHERE map = ? ORDER BY slot"
         rows = list(self._rows(select, map_number))
         for *place, crc, content in rows:
@@ -261,7 +258,7 @@ class StateReader:
         return places[:, 0], places[:, 1:], voxels
 
     def region(self, map_number: int, region: Region) -> BlockRecords:
-        """Blocks of a region of a map that left the memory."""
+        """Blocks of a paged-out region."""
         columns, where = ", ".join(COLUMNS), "map = ? AND x = ? AND y = ? AND z = ?"
         select = f"SELECT level, crc, {columns} FROM regions WHERE {where} ORDER BY level"
         rows = list(self._rows(select, map_number, *region))
@@ -273,7 +270,7 @@ class StateReader:
             raise self._damaged(f"region {region}: {error}") from error
 
     def frame(self, store: int, serial: int) -> EncodedFrame:
-        """A stored frame by its serial: depth, colour and mask as files."""
+        """A stored frame by serial: depth, colour and mask files."""
         select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
         rows = list(self._rows(select, store, serial))
         if not rows or not all(isinstance(content, bytes) for content in rows[0]):
@@ -286,7 +283,7 @@ class StateReader:
         return [row[0] for row in self._rows("SELECT number FROM frames WHERE store = ? ORDER BY number", store)]
 
     def release(self) -> None:
-        """Release the checkpoint seen since opening; later reads see the newest."""
+        """Release the checkpoint; later reads see the newest."""
         self._connection.execute("COMMIT")
 
     def close(self) -> None:
@@ -306,7 +303,7 @@ class StateReader:
         return StateError(f"the state of the run in {self.path} is damaged: {what}")
 
     def _is_too_long(self) -> bool:
-        """Whether a statement must end; SQLite calls it so that Python handles ctrl-C."""
+        """Whether a statement must end; SQLite calls it, so that Python handles ctrl-C."""
         self._left -= 1
         return self._left <= 0
 

@@ -1,4 +1,4 @@
-"""Store a system in a database, restore it, and check that a stored state fits code and recording."""
+"""Store and restore a system, and check that a state fits code and recording."""
 
 import hashlib
 from collections.abc import Mapping
@@ -28,8 +28,7 @@ CODE = ("config.py", "core", "app/state", "app/pipeline/metrics.py", "app/pipeli
 
 @cache
 def code_fingerprint() -> str:
-    """Checksum of the code that computes a state and of the versions of its libraries: other code would mix two
-    results."""
+    """Checksum of the code and library versions behind a state."""
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
     root = Path(str(files("dudmap")))
     for part in CODE:
@@ -40,7 +39,7 @@ def code_fingerprint() -> str:
 
 
 def recording_fingerprint(sequence: "Sequence") -> str:
-    """Checksum of the times, the camera and the first readable frame of a recording."""
+    """Checksum of times, camera and first readable frame."""
     digest = hashlib.sha256(np.ascontiguousarray(sequence.timestamps, np.float64).tobytes())
     digest.update(repr((astuple(sequence.camera), len(sequence))).encode())
     digest.update(frame_fingerprint(sequence, 0).encode())
@@ -48,7 +47,7 @@ def recording_fingerprint(sequence: "Sequence") -> str:
 
 
 def frame_fingerprint(sequence: "Sequence", index: int) -> str:
-    """Checksum of a frame of a recording; see ``images_fingerprint``."""
+    """Checksum of a frame; see ``images_fingerprint``."""
     try:
         return images_fingerprint(sequence[index])
     except FrameError as error:
@@ -66,7 +65,7 @@ def images_fingerprint(frame: "Frame | Exception") -> str:
 
 
 def take_snapshot(parts: Mapping[str, object], database: StateDatabase, *, wait: bool = True) -> Snapshot:
-    """Take the state of named parts, without content that the database already holds.
+    """Take the state of named parts, without content in the database.
 
     Without ``wait`` it raises ``NotSettledError`` during background computations.
 
@@ -77,14 +76,14 @@ def take_snapshot(parts: Mapping[str, object], database: StateDatabase, *, wait:
 
 
 def parts_of(slam: "Slam") -> dict[str, object]:
-    """Parts of a system's state, including its first pass, if any."""
+    """Parts of a system's state, including its first pass."""
     first = slam.first_pass
     before = {} if first is None else {"first arguments": first.arguments, "first slam": first}
     return before | {"arguments": slam.arguments, "slam": slam}
 
 
 def read_system(tree: TreeReader, device: str | None, which: str = "") -> "Slam":
-    """Restore the system of these parts, on another device if one is given."""
+    """Restore a system from these parts, on ``device`` if given."""
     from dudmap.core.slam import Slam, SlamArguments
 
     first = read_system(tree, device, "first ") if not which and "first slam" in tree else None
@@ -96,7 +95,7 @@ def read_system(tree: TreeReader, device: str | None, which: str = "") -> "Slam"
 
 
 def save_system(slam: "Slam", path: str | Path) -> None:
-    """Write the whole state of a system for ``resume_system``; an older file is replaced at the end.
+    """Write a system's state for ``resume_system``; replaces an older file at the end.
 
     Raises:
         StateError: The file cannot be written.
@@ -120,13 +119,12 @@ def save_system(slam: "Slam", path: str | Path) -> None:
 
 
 def resume_system(path: str | Path, device: str | None = None) -> "Slam":
-    """Restore a system that ``save_system`` wrote; later frames give bit-identical results.
+    """Restore a system of ``save_system``, with bit-identical results; on another ``device`` they differ by rounding.
 
-    On another ``device`` the results differ by rounding. The file must not change while the system lives, because
-    stored frames are read from it.
+    The file must stay, because stored frames are read from it.
 
     Raises:
-        StateError: The file is missing, damaged, or was written by another version.
+        StateError: The file is missing, damaged, or of another version.
     """
     path = Path(path)
     reader = StateReader(path)
@@ -136,12 +134,12 @@ def resume_system(path: str | Path, device: str | None = None) -> "Slam":
 
 
 def on_device(config: Config, device: str | None) -> Config:
-    """Configuration with another device; None keeps the device."""
+    """Configuration with another device; None keeps it."""
     return config if device is None else config.override([f"device={device}"])
 
 
 def check_code(meta: dict[str, Any], path: Path) -> None:
-    """Refuse a state that was written by another version."""
+    """Refuse a state of another version."""
     if meta.get("code") != code_fingerprint():
         raise StateError(
             f"{path} was written by another version of dudmap or its libraries ({meta.get('versions', 'unknown')}); "

@@ -1,12 +1,10 @@
-"""Convert state to a tree of plain values and arrays, and back, by the annotations of its classes.
+"""State as a tree of plain values and arrays, and back, by annotations, which determine classes.
 
-The annotation of an attribute determines the class of its value; a value that does not fit raises an error.
+A value that does not fit raises an error.
 
-- A ``Stateful`` object is restored in place, after its owner created it.
-- Dataclasses and named tuples are created from their fields, once for an object that occurs twice.
-- Functions without arguments and futures are stored by their result.
+- A ``Stateful`` object is restored in place.
 
-A node is a number, a text, None, or an object with an ``id`` for references.
+A node is a number, text, None, or an object with an ``id``.
 """
 
 from collections import deque
@@ -34,20 +32,18 @@ if TYPE_CHECKING:
     from dudmap.app.state.database import StateDatabase, StateReader
 
 LONG = 32
-"""Shortest list of equal things stored as one array."""
+"""Shortest list stored as one array."""
 LARGEST_COUNT = 2**23
-"""Largest number of equal things stored as one array."""
+"""Largest number of things in one array."""
 
 
 class NotSettledError(Exception):
-    """A background computation runs; the state can be stored at a later frame."""
+    """A background computation runs; store at a later frame."""
 
 
 class TreeWriter:
-    """Takes a snapshot, without content that ``maps`` and ``frames`` find in the database.
-
-    For ``wait`` see ``take_snapshot``.
-    """
+    """Takes a snapshot without content that ``maps`` and ``frames`` find in the database; ``wait`` as for
+    ``take_snapshot``."""
 
     def __init__(self, maps: StoredMaps, frames: "StoredFrames", *, wait: bool) -> None:
         self.snapshot = Snapshot()
@@ -55,7 +51,7 @@ class TreeWriter:
         self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity; the value stays alive
 
     def take(self, parts: Mapping[str, object]) -> Snapshot:
-        """Take the snapshot of the parts of a state."""
+        """Take the snapshot of named parts."""
         for name, value in parts.items():
             try:
                 self.snapshot.tree[name] = self._node(value, type(value), name)
@@ -113,7 +109,6 @@ class TreeWriter:
         }
 
     def _items(self, items: list[Any], hints: Sequence[Any], place: str, constant: bool) -> Node:
-        """Nodes of a list, or one node for many items of one kind."""
         kinds = {type(item) for item in items} if len(items) >= LONG else set()
         kind = kinds.pop() if len(kinds) == 1 else None
         if kind is str or hints[:1] == [RECORD]:
@@ -154,10 +149,10 @@ class TreeWriter:
 
 
 class TreeReader:
-    """Reads the parts of a stored state, in the order in which they were written.
+    """Reads the parts of a stored state, in the order of writing.
 
     Args:
-        reader: Open database; it must stay open while the system lives, because stored frames are read on demand.
+        reader: Open database, which must stay open: stored frames are read on demand.
 
     Raises:
         StateError: There is no state yet; all methods: it is damaged or of another version.
@@ -182,7 +177,7 @@ class TreeReader:
         self._reader.release()
 
     def part(self, name: str, hint: Any, current: Any = None) -> Any:  # noqa: ANN401
-        """Read the named part with an annotation; a ``Stateful`` object is restored into the new object ``current``."""
+        """Read a part with an annotation; a ``Stateful`` one into the new object ``current``."""
         self._at = [name]
         try:
             return self._value(self._tree[name], hint, current)
@@ -241,7 +236,7 @@ class TreeReader:
         return deque(items, node["limit"]) if kind is deque else kind(items) if kind in (tuple, set) else items
 
     def _named(self, content: Node, hints: dict[str, Any], kind: type, current: object = None) -> dict[str, Any]:
-        """Attributes by name, exactly those in ``hints``."""
+        """Attributes by name, exactly as in ``hints``."""
         _check_names(content, hints, kind)
         out = {}
         for name, hint in hints.items():

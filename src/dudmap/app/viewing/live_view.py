@@ -1,4 +1,4 @@
-"""Fill the page in the browser from a running run, or from a run folder."""
+"""Fill the browser page from a running run, or a run folder."""
 
 import threading
 import time
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
 
 PERIOD = 0.1
-"""Shortest time between two updates of the page, seconds."""
+"""Seconds between updates of the page."""
 TRIANGLES = 1_000_000
-"""Most triangles sent to the browser: 40 MB."""
+"""Triangles sent to the browser: 40 MB."""
 
 
 @dataclass
 class _Update:
-    """Data that the page does not show yet: metrics of all frames, images of the latest one."""
+    """Data not shown yet: metrics of all frames, latest images."""
 
     figures: list[FrameFigures] = field(default_factory=list)
     images: FrameImages | None = None
@@ -45,10 +45,8 @@ class _Update:
 class LiveView(RunObserver):
     """Shows a running run in a window.
 
-    The thread of the run copies data into a slot, and another thread shows it. A later image replaces an earlier one
+    A slot passes the latest data to another thread, so that the run never waits. A later image replaces an earlier one
     that is still in the slot, so that the run never waits for the page.
-
-    Attributes:
     """
 
     def __init__(self, window: Window) -> None:
@@ -103,11 +101,7 @@ class LiveView(RunObserver):
                 self._changed.notify()
 
     def close(self) -> None:
-        """End the thread once all data are shown.
-
-        Raises:
-            Exception: Error of the page's thread.
-        """
+        """End the thread once all is shown."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -155,10 +149,10 @@ class LiveView(RunObserver):
 
 
 def open_run(folder: str | Path, host: str, port: int, token: str | None = None) -> Window:
-    """Open a window with a run folder; the slider is at the first frame.
+    """Open a window with a run folder.
 
     Raises:
-        DudmapError: The folder is no complete run folder, viser is missing, or the port is in use.
+        DudmapError: No complete run folder, no viser, or the port is in use.
     """
     run = RunFiles.load(folder)
     window = Window(host, port, str(run.metrics.get("sequence") or run.folder.name), token)

@@ -1,4 +1,4 @@
-"""Changed parts of a growing map, at a bounded cost per frame."""
+"""Changed parts of a growing map, at a bounded cost."""
 
 import threading
 import time
@@ -12,11 +12,10 @@ if TYPE_CHECKING:
     from dudmap.core.map.volume import TsdfVolume
 
 BUDGET_MS = 1.0
-"""Mean time per frame for copying the map, milliseconds: a third of the allowed cost of a viewer."""
+"""Milliseconds per frame for copying: a third of a viewer's allowance."""
 BLOCKS = 512
-"""Most blocks per copy: 2 MB, a millisecond."""
 LONGEST_WAIT = 15
-"""Frames after which another copy is allowed in any case."""
+"""Frames until another copy is allowed."""
 
 
 @dataclass
@@ -24,7 +23,7 @@ class MeshChanges:
     """Changed parts of the mesh.
 
     Attributes:
-        chunks: Mesh of each changed part; None if its surface is gone.
+        chunks: Mesh of each part; None if gone.
     """
 
     chunks: dict[Chunk, Mesh | None] = field(default_factory=dict)
@@ -32,10 +31,9 @@ class MeshChanges:
 
 
 class MeshFeed:
-    """Copies a growing map from the thread that changes it to a thread that extracts its mesh.
+    """Copies a growing map for a thread that extracts its mesh.
 
-    Each frame adds ``budget_ms`` to a budget. If it covers the cost of the last copy, which must be extracted, up to
-    ``BLOCKS`` changed blocks are copied.
+    Each frame adds ``budget_ms``; if that covers the last copy's cost, up to ``BLOCKS`` changed blocks are copied.
     """
 
     def __init__(self, budget_ms: float = BUDGET_MS) -> None:
@@ -54,7 +52,7 @@ class MeshFeed:
         return not self._free.is_set()
 
     def offer(self, volume: "TsdfVolume", *, now: bool = False) -> None:
-        """Copy changed blocks if budget and receiver allow; with ``now``, once the receiver is ready."""
+        """Copy changed blocks if budget and receiver allow; ``now``: once the receiver is ready."""
         self._saved += self._budget
         if now:
             self._free.wait()
@@ -68,7 +66,7 @@ class MeshFeed:
         self._free.clear()
 
     def take(self) -> MeshChanges:
-        """Changes since the last call; empty if nothing new was copied."""
+        """Changes since the last call."""
         if not self.has_copy or self._mirror is None:
             return MeshChanges()
         reset = self._extracted is not self._mirror
@@ -81,7 +79,7 @@ class MeshFeed:
             self._free.set()
 
     def changes(self, volume: "TsdfVolume", *, now: bool = False) -> MeshChanges:
-        """``offer`` and ``take`` in one thread; both use the budget."""
+        """``offer`` and ``take`` in one thread."""
         start = time.perf_counter()
         self.offer(volume, now=now)
         if not self.has_copy:

@@ -1,4 +1,4 @@
-"""Metrics of a run in groups, with names and units for people."""
+"""Metrics of a run in groups, with units."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,7 @@ Table = list[tuple[str, list[tuple[str, str]]]]
 
 
 class Named(NamedTuple):
-    """Name of a metric, and the format of its value with the unit, after a factor."""
+    """Name, format with unit, and factor of a metric."""
 
     name: str
     form: str = "{:.0f}"
@@ -84,11 +84,10 @@ GROUPS = {
         "versions.python": Named("Python"),
     },
 }
-"""Names of metrics of metrics.json by group and key; a dot leads into a tree."""
 
 
 def metrics_table(metrics: dict[str, Any]) -> Table:
-    """The metrics that have a value, in groups."""
+    """The known metrics, in groups."""
     groups = []
     for heading, named in GROUPS.items():
         found = [(one, _value(metrics, key)) for key, one in named.items()]

@@ -1,4 +1,4 @@
-"""Access control of a served page: this machine only, or clients with a secret address."""
+"""Access to a page: this machine, or clients with a secret address."""
 
 import ipaddress
 import re
@@ -18,15 +18,14 @@ POLICY_VIOLATION = 1008
 
 
 class PageAccess:
-    """Decides which connections may see the page.
+    """Decides who may see the page.
 
-    - Without a token a connection must name the loopback, which excludes pages that resolve their own name to it (DNS
-      rebinding).
+    - Without a token a connection must name the loopback, against DNS rebinding.
     - With a token the path must be the token.
-    - The ``Origin`` must be this page, which excludes connections by other pages in the user's browser.
+    - The ``Origin`` must be this page, against other pages in the browser.
 
     Args:
-        token: Secret part of the address; None generates one if ``host`` admits other machines.
+        token: Secret; None generates one if ``host`` admits other machines.
 
     Attributes:
         token: The secret, empty if none is needed.
@@ -47,7 +46,7 @@ class PageAccess:
 
     @property
     def url(self) -> str:
-        """Address to open in a browser; with a token, its query tells viser's page where to connect."""
+        """Address to open; a query tells viser's page the token."""
         name = "localhost" if self.local else self.host
         if name in ("0.0.0.0", "::", ""):
             name = socket.gethostname()
@@ -62,7 +61,7 @@ class PageAccess:
         return f"on {self.host} for every machine that reaches it, with this address only; it is not encrypted"
 
     def allows(self, path: str, headers: Mapping[str, str]) -> bool:
-        """Whether a connection with this path and these headers may see the page."""
+        """Whether a connection may see the page."""
         host, origin = headers.get("Host", ""), headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
             return False
@@ -72,8 +71,7 @@ class PageAccess:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
 
     def guard(self, server: Any) -> None:  # noqa: ANN401 - viser.ViserServer, of an optional package
-        """Close every forbidden connection to a viser server, also earlier ones, before anything is sent; no page
-        can publish it through viser's relay."""
+        """Close every forbidden connection to a viser server before anything is sent; bars viser's relay."""
         connections = server._websock_server
 
         async def check(client: Any) -> None:  # noqa: ANN401 - viser.infra.WebsockClientConnection
@@ -89,7 +87,7 @@ class PageAccess:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address belongs to this machine alone."""
+    """Whether a name or address is this machine alone."""
     if host.lower() == "localhost":
         return True
     try:
@@ -99,7 +97,7 @@ def is_loopback(host: str) -> bool:
 
 
 def port_problem(host: str, port: int) -> str:
-    """Why a port cannot serve a page; empty if it can."""
+    """Why a port cannot serve; empty if it can."""
     with socket.socket() as probe:
         if sys.platform != "win32":  # Windows would let two programs take one port
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -11,14 +11,14 @@ from dudmap.core.geometry.mesh import Mesh
 def first_hit(
     origin: NDArray[np.float64], direction: NDArray[np.float64], meshes: Iterable[Mesh]
 ) -> NDArray[np.float64] | None:
-    """Nearest point (3,) in which a ray meets the front of a triangle; None if it meets none."""
+    """Nearest point (3,) of a ray on the front of a triangle; None if it hits none."""
     distances = [_distance(origin, direction, mesh) for mesh in meshes]
     nearest = min(distances, default=np.inf)
     return origin + nearest * direction if np.isfinite(nearest) else None
 
 
 def _distance(origin: NDArray[np.float64], direction: NDArray[np.float64], mesh: Mesh) -> float:
-    """Distance in units of ``direction`` to the nearest triangle (Moeller and Trumbore 1997)."""
+    """Distance in ``direction`` units (Moeller and Trumbore 1997)."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     from_a, across = origin - a, np.cross(direction, c - a)
     det = np.einsum("ij,ij->i", b - a, across)  # positive if the triangle is seen from its front

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 POINTS = 400
-"""Most points of a curve over time: a plot is about this many pixels wide."""
+"""Points of a curve over time: its pixels."""
 
 
 def plots(run: RunFiles) -> dict[str, str]:
-    """SVG text by title of the plots with data: trajectory, its error, dynamic share, residuals."""
+    """SVG text by title: trajectory, error, dynamic share, residuals."""
     out: dict[str, str] = {}
     if len(run.trajectory) > 1:
         out["Trajectory seen from above"] = _from_above(run)
@@ -39,7 +39,7 @@ def plots(run: RunFiles) -> dict[str, str]:
 
 
 def _from_above(run: RunFiles) -> str:
-    """Trajectories on the ground, the first view pointing upwards; lost parts are dashed."""
+    """Trajectories on the ground, first view upwards; lost parts dashed."""
     across, frames = _ground_axes(run), run.figures()
     places = [np.full(3, np.nan) if frame.T_world_camera is None else frame.T_world_camera[:3, 3] for frame in frames]
     path = np.array(places) @ across.T
@@ -66,7 +66,6 @@ def _from_above(run: RunFiles) -> str:
 
 
 def _ground_axes(run: RunFiles) -> NDArray[np.float64]:
-    """Axes (2, 3) of the ground plane: to the right and ahead of the first camera."""
     Ts = run.trajectory.Ts_world_camera
     given = (run.metrics.get("up") or {}).get("direction")
     up = -Ts[:, :3, 1].mean(axis=0) if given is None else np.array(given, dtype=float)
@@ -128,7 +127,6 @@ def _limits(t: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means of about ``POINTS`` equal groups of consecutive frames, which bound the size of the plot."""
     starts = np.arange(0, len(t), max(1, len(t) // POINTS))
     counts = np.diff(np.append(starts, len(t)))
     return np.add.reduceat(t, starts) / counts, np.add.reduceat(y, starts) / counts
@@ -136,7 +134,6 @@ def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.
 
 @contextmanager
 def _drawing(name: str, height: float = 2.8) -> "Iterator[tuple[Figure, list[str]]]":
-    """Figure, and a list that holds its SVG text afterwards; equal data give equal text."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure

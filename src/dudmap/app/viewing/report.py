@@ -1,4 +1,4 @@
-"""Report of a run: one HTML page without network or server, and its thumbnails."""
+"""Report of a run: one offline HTML page, and thumbnails."""
 
 import base64
 import gzip
@@ -35,22 +35,22 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
 
 NUMBER = 36
-"""Frames that are kept: about 1.5 MB of JPEG files."""
+"""Kept frames: about 1.5 MB."""
 
 STEPS = 65535
 """Steps of a coordinate over the mesh: 0.15 mm in a map of 10 m."""
 REPORT = "report.html"
 TRIANGLES = 200_000
-"""Most triangles of the mesh in the page: about 1.5 MB, fluent without a graphics card."""
+"""Triangles in the page: about 1.5 MB."""
 POSES = 5000
-"""Most poses in the page; longer trajectories are thinned evenly."""
+"""Poses in the page, thinned evenly."""
 POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
-"""Content security policy: only the page's own scripts (by hash), styles and pictures."""
+"""Content security policy: the page's own content only."""
 NOT_INCLUDED = "preprocess", "movers"
-"""Stages outside of the time to the result: in the reader's thread, and after the result."""
+"""Stages outside the time to the result."""
 COLORS = "#2f6fb5", "#d98a00", "#2e8b57", "#c8322d", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5", "#9aa7b6"
 LISTED = 200
-"""Most lost or unreadable frames that are listed one by one."""
+"""Lost or unreadable frames listed one by one."""
 CARDS = {
     "frames": ("frames", 1, "{:.0f}"),
     "lost": ("lost", 1, "{:.0f}"),
@@ -60,12 +60,11 @@ CARDS = {
     "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
     "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
 }
-"""Key of metrics.json to label, factor and format of the metrics at the top."""
+"""Label, factor and format of the metrics at the top, by key."""
 
 
 class Thumbnails(RunObserver):
-    """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` evenly spaced frames, of a camera up to ``2
-    NUMBER``."""
+    """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` even frames, of a camera up to ``2 NUMBER``."""
 
     in_background = True
 
@@ -80,7 +79,7 @@ class Thumbnails(RunObserver):
         remove_files(out, {FOLDER: WRITTEN[FOLDER]})  # of the first pass; timestamps of a live run may differ
 
     def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
-        """Keep the images of the frames before number ``first``."""
+        """Keep the images of frames before ``first``."""
         self._out, self._count, self._step, self._kept = out / FOLDER, count, 1, []
         make_folder(self._out)
         self._next = self._next_after(first - 1)
@@ -105,7 +104,6 @@ class Thumbnails(RunObserver):
         return -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
 
     def _thin(self) -> None:
-        """If there are too many, remove every second frame and keep half as many in future."""
         if len(self._kept) <= 2 * NUMBER:
             return
         with OwnFolder(self._out) as folder:
@@ -115,7 +113,7 @@ class Thumbnails(RunObserver):
 
 
 class Html(str):
-    """Trusted HTML: made by ``html`` or ``joined``, or shipped with dudmap. All other text is escaped."""
+    """Trusted HTML of ``html``, ``joined`` or dudmap; other text is escaped."""
 
     __slots__ = ()
 
@@ -131,21 +129,20 @@ def html(template: str, /, **values: object) -> Html:
 
 
 def joined(parts: Iterable[object], between: str = "") -> Html:
-    """Concatenate parts; parts that are not ``Html`` are escaped."""
+    """Concatenate parts, escaping others than ``Html``."""
     return Html(between.join(html("{part}", part=part) for part in parts))
 
 
 def script_source(script: str) -> str:
-    """Source in a content security policy that allows this script."""
+    """Source in a content security policy for this script."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
 def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
-    """Description of a mesh for the page, and its data as base64 text of a gzip stream.
+    """Description of a mesh, and its data as base64 of gzip.
 
-    The stream holds, little-endian: positions, uint16 (V, 3), from the corner ``low`` (0) to ``high`` (65535) of the
-    bounding box; colours, uint8 (V, 3); zeros up to a multiple of 4 bytes; faces, int32 (F, 3). Each face index is
-    stored as the difference to the previous one, which compresses well.
+    Little-endian: positions, uint16 (V, 3), from ``low`` (0) to ``high`` (65535) of the box; colours, uint8 (V, 3);
+    zeros up to a multiple of 4 bytes; faces, int32 (F, 3), as differences to the previous index.
     """
     low, high = mesh.vertices.min(axis=0).astype(float), mesh.vertices.max(axis=0).astype(float)
     positions = np.rint((mesh.vertices - low) / np.maximum(high - low, 1e-9) * STEPS).astype("<u2")
@@ -162,13 +159,13 @@ def packed(mesh: Mesh) -> tuple[dict[str, Any], str]:
 
 
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
-    """Write the report of a run folder, by default report.html in it, and return its path.
+    """Write the report of a run folder, by default report.html in it; return its path.
 
     The page shows the mesh (at most ``TRIANGLES`` triangles) with trajectory and moving objects in 3D, thumbnails,
     plots, metrics, configuration, and lost frames with reasons.
 
     Raises:
-        DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.
+        DudmapError: No complete run folder, a newer version, or the page cannot be written.
     """
     path = Path(out) if out is not None else Path(folder) / REPORT
     run = RunFiles.load(folder)
@@ -202,7 +199,7 @@ def report_page(run: RunFiles) -> str:
 
 
 def filled(name: str, data: dict[str, Any], parts: dict[str, Any]) -> str:
-    """HTML of a page of the page folder, filled with its parts, style, scripts and data."""
+    """HTML of a page, filled with parts, style, scripts and data."""
     library = f"\n/* three.js\n{asset('three.LICENSE.txt')}*/\n{asset('three.min.js')}"
     script = Html(asset("scene.js") + asset(f"{name}.js"))
     parts = parts | {
@@ -214,7 +211,7 @@ def filled(name: str, data: dict[str, Any], parts: dict[str, Any]) -> str:
 
 
 def scene_data(run: RunFiles) -> dict[str, Any]:
-    """Camera, and per shown pose its time, position with quaternion (x y z qx qy qz qw), and moving objects."""
+    """Camera, and per pose time, position with quaternion (x y z qx qy qz qw), moving objects."""
     chosen = np.unique(np.linspace(0, len(run.trajectory) - 1, min(POSES, len(run.trajectory))).astype(int))
     Ts = run.trajectory.Ts_world_camera[chosen]
     times = run.trajectory.timestamps[chosen]
@@ -236,7 +233,7 @@ def scene_data(run: RunFiles) -> dict[str, Any]:
 
 
 class ReportObserver(Thumbnails):
-    """Keeps the thumbnails of a run and writes its report at the end."""
+    """Keeps thumbnails and writes the report at the end."""
 
     def finish(self, out: Path) -> None:
         """Write report.html."""

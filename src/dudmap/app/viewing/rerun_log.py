@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from dudmap.core.slam import Slam
 
 BUDGET_MS = 10.0
-"""Mean time per frame for extracting the changed parts of the map, milliseconds."""
+"""Milliseconds per frame for extracting changed map parts."""
 
 
 class RerunLog(RunObserver):
-    """Writes camera, images, map, moving objects and metrics of every frame into an .rrd file.
+    """Writes camera, images, map, moving objects and metrics into an .rrd file.
 
     Timelines: ``frame`` (number) and ``time`` (seconds since the first frame). Entities: ``world/camera`` with colour
     and depth, ``world/map``, ``world/movers``, ``world/trajectory``; ``images/mask`` and ``images/residuals``; the
     plots ``plots/ms``, ``plots/residual_mm``, ``plots/moving_percent``; ``lost`` with the reasons.
 
     Raises:
-        DudmapError: rerun-sdk is not installed, or the file cannot be written.
+        DudmapError: No rerun-sdk, or the file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,7 +51,7 @@ class RerunLog(RunObserver):
         self._start: float | None = None
 
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
-        """Follow this system; frames of an earlier pass are overwritten one by one."""
+        """Follow this system; a later pass overwrites frames."""
         self._slam, self._feed = slam, MeshFeed(BUDGET_MS)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:

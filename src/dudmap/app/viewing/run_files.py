@@ -21,21 +21,21 @@ from dudmap.io.exporting.run_content import RunContent
 FOLDER = "thumbnails"
 NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency", "shed")
 MAX_TRIANGLES = 5_000_000
-"""Most triangles of a mesh in a page or window; a larger mesh is simplified."""
+"""Triangles in a page or window; larger meshes are simplified."""
 LARGEST_THUMBNAIL = 2**22
-"""Largest thumbnail, bytes; usual ones have 10 to 30 kB."""
+"""Largest thumbnail, bytes; usual: 10 to 30 kB."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunFiles(RunContent):
-    """A run with its data for viewers; trajectory and mesh may be missing."""
+    """A run for viewers, with or without trajectory and mesh."""
 
     @classmethod
     def load(cls, folder: str | Path) -> "RunFiles":
         """Open a run folder.
 
         Raises:
-            DatasetError: The folder is no run folder, or was written by a newer version.
+            DatasetError: No run folder, or a newer version.
         """
         folder = Path(folder)
         if not folder.is_dir():
@@ -55,10 +55,8 @@ class RunFiles(RunContent):
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """Mesh without its smallest loose pieces; None if no frame was fused.
-
-        A very large mesh is simplified while it is read, because it may not fit into the memory.
-        """
+        """Mesh without its smallest pieces; None if no frame was fused. A very large one is simplified while
+        reading."""
         path = self.folder / "mesh.ply"
         if not path.is_file() or not self.metrics.get("mesh_triangles"):
             return None
@@ -68,13 +66,13 @@ class RunFiles(RunContent):
 
     @cached_property
     def truth(self) -> Trajectory | None:
-        """The true trajectory in its own world, None if it is not known."""
+        """True trajectory in its own world, or None."""
         path = self.folder / "groundtruth.txt"
         return Trajectory.load(path) if path.is_file() else None
 
     @cached_property
     def errors(self) -> AteResult | None:
-        """Absolute errors of the trajectory; None without a true one, or if both do not match in time."""
+        """Absolute trajectory errors; None without ground truth or match in time."""
         try:
             return None if self.truth is None else ate(self.trajectory, self.truth)
         except DatasetError:  # accuracy_missing in metrics.json gives the reason
@@ -82,7 +80,7 @@ class RunFiles(RunContent):
 
     @cached_property
     def keyframes(self) -> np.ndarray:
-        """Poses (N, 4, 4) of the places that the map is recognised by; none without a saved map."""
+        """Poses (N, 4, 4) of keyframes; none without a saved map."""
         path = self.folder / KEYFRAME_FILE
         poses = [keyframe.T_world_camera for keyframe in load_keyframes(path)[0]] if path.is_file() else []
         return np.array(poses).reshape(-1, 4, 4)
@@ -96,7 +94,7 @@ class RunFiles(RunContent):
 
     @cached_property
     def frames(self) -> list[dict[str, str]]:
-        """Rows of timings.csv: timestamp, state, times; one per processed frame."""
+        """Rows of timings.csv, one per frame."""
         path = self.folder / "timings.csv"
         if not path.is_file():
             return []
@@ -113,7 +111,7 @@ class RunFiles(RunContent):
 
     @property
     def stages(self) -> list[str]:
-        """Names of the processing stages, in the order of the columns of timings.csv."""
+        """Stages in the order of timings.csv."""
         return [key for key in self.frames[0] if key not in NOT_STAGES] if self.frames else []
 
     def column(self, name: str) -> np.ndarray:
@@ -122,7 +120,7 @@ class RunFiles(RunContent):
 
     @cached_property
     def boxes(self) -> dict[str, tuple[MoverBox, ...]]:
-        """Moving objects by the timestamp of the frame, as text with six decimals."""
+        """Moving objects by timestamp, as text."""
         with damaged(DatasetError, self.folder / "movers.jsonl"):
             return {
                 f"{row['timestamp']:.6f}": tuple(
@@ -134,7 +132,7 @@ class RunFiles(RunContent):
 
     @cached_property
     def thumbnails(self) -> dict[str, dict[str, bytes]]:
-        """JPEG files by kind of image, by the timestamp of the frame as text."""
+        """JPEG files by kind, by timestamp as text."""
         out: dict[str, dict[str, bytes]] = {}
         with damaged(DatasetError, self.folder / FOLDER):
             for path in (self.folder / FOLDER).glob("*.jpg"):
@@ -144,7 +142,7 @@ class RunFiles(RunContent):
             return dict(sorted(out.items(), key=lambda item: float(item[0])))
 
     def figures(self) -> list[FrameFigures]:
-        """Pose, moving objects and metrics of every processed frame; residuals per frame are not stored."""
+        """Pose, moving objects and metrics of every frame, without residuals."""
         path = self.trajectory
         if not self.frames:  # merged maps have trajectories and no frames
             pairs = zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True)

@@ -1,4 +1,4 @@
-"""Display data of one frame (reduced images, pose, moving objects, metrics), and overview images."""
+"""Display data of one frame, and overview images."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
 
 WIDTH = 320
-"""Largest width of the shown images, pixels."""
+"""Width of shown images, pixels."""
 DEPTH_RANGE = 5.0
-"""Depth at the end of the colour scale, metres: the range of structured light."""
+"""End of the depth's colour scale, metres: structured light's range."""
 RESIDUAL_RANGE = 0.05
-"""Residual at the ends of the colour scale, metres."""
+"""Ends of the residuals' colour scale, metres."""
 KINDS = ("color", "depth", "mask", "residuals")
 _NO_READING = np.array([40, 40, 40], dtype=np.uint8)
 
 LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
-"""Unit vector towards the light of the shaded view, camera frame."""
+"""Unit vector towards the light, camera frame."""
 TITLE = 28
 
 
@@ -37,7 +37,7 @@ class MoverBox:
     """A moving object in one frame.
 
     Attributes:
-        box: (2, 3) metres, world frame, smallest and largest coordinates.
+        box: (2, 3) metres, world frame, extreme coordinates.
         speed: m/s.
     """
 
@@ -54,7 +54,7 @@ class FrameFigures:
         timestamp: Seconds.
         T_world_camera: (4, 4), None if lost.
         ms: Processing time, milliseconds.
-        residual: Root mean square of the distance residuals at 1 m depth, metres; NaN without registration.
+        residual: Root mean square distance residual at 1 m, metres; NaN without registration.
     """
 
     timestamp: float
@@ -94,15 +94,12 @@ class FrameImages:
 
     @classmethod
     def of(cls, frame: "Frame", result: "FrameResult", width: int = WIDTH) -> "FrameImages":
-        """Every n-th pixel of the images of a frame, at most ``width`` columns."""
+        """Every n-th pixel, at most ``width`` columns."""
         parts = (frame.rgb, frame.depth, result.dynamic_mask, result.residuals)
         return cls(*(_reduced(part, width) for part in parts))
 
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
-        """Images (h, w, 3) uint8 by the names of ``KINDS``: colour, coloured depth, mask over colour, residuals.
-
-        The first frame of a map has no residuals.
-        """
+        """Images (h, w, 3) uint8 by ``KINDS``; no residuals in the first frame of a map."""
         pictures = {
             "color": self.color,
             "depth": depth_colors(self.depth),
@@ -116,12 +113,12 @@ class FrameImages:
 
 
 def shading(normals: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Brightness (H, W), 0..1, of a view with normals (H, W, 3), world frame, and a light near the camera."""
+    """Brightness (H, W), 0..1, of normals (H, W, 3), world frame, lit near the camera."""
     return (0.25 + 0.7 * np.clip(normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)).astype(np.float32)
 
 
 def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArray[np.uint8]:
-    """Depth (h, w) in the turbo colour scale (h, w, 3) up to ``far``; missing depth is dark."""
+    """Depth (h, w) in the turbo scale (h, w, 3) up to ``far``; missing is dark."""
     import cv2
 
     scaled = np.clip(255 * depth / far, 0, 255).astype(np.uint8)
@@ -131,7 +128,7 @@ def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArr
 
 
 def mask_overlay(color: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Dimmed colour image (h, w, 3) with masked pixels tinted red."""
+    """Dimmed image (h, w, 3) with masked pixels red."""
     dim = np.right_shift(color, 1)
     if mask.shape != color.shape[:2]:  # a colour camera of another size has no mask
         return dim
@@ -140,7 +137,7 @@ def mask_overlay(color: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[n
 
 
 def residual_colors(residuals: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Signed residuals (h, w) from blue (-) over white to red (+) (h, w, 3), dark off the map."""
+    """Residuals (h, w) from blue (-) over white to red (+) (h, w, 3), dark off the map."""
     known = np.isfinite(residuals)
     share = np.clip(np.where(known, residuals, 0) / RESIDUAL_RANGE, -1, 1)[..., None]
     red, blue = np.array([178.0, 24, 43]), np.array([33.0, 102, 172])
@@ -169,9 +166,9 @@ def save_sheet(
     T_world_camera: NDArray[np.float64],
     true_mask: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Write a PNG file with colour, depth, dynamic mask, residuals and the map rendered from the frame's pose (4, 4).
+    """Write a PNG file with colour, depth, mask, residuals and the map from the frame's pose (4, 4).
 
-    ``residuals`` (h, w) are signed distances in metres, NaN if unknown; ``true_mask`` (H, W) is drawn as an outline.
+    ``residuals``: (h, w) signed, metres, NaN = unknown; ``true_mask`` (H, W): outline.
 
     Raises:
         DudmapError: The file cannot be written.
@@ -196,7 +193,7 @@ def save_sheet(
 
 
 def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
-    """Write a PNG file with colour and depth of numbered frames of a recording, one frame a column, six in a row.
+    """Write a PNG file with colour and depth of numbered frames, six in a row.
 
     Raises:
         DudmapError: There is no frame, or the file cannot be written.

@@ -1,4 +1,4 @@
-"""A page in the browser with map, camera, moving objects, images and plots, served by viser."""
+"""A browser page with map, camera, moving objects, images and plots, by viser."""
 
 import io
 import threading
@@ -26,27 +26,26 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
 
 MAX_IMAGES = 300
-"""Frames whose images are kept for the time slider: about 20 MB; more are thinned evenly."""
+"""Frames with images on the slider: 20 MB; more are thinned."""
 PLOT_POINTS = 500
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
 CHANGE_COLORS = {"appeared": (60, 200, 90), "disappeared": (230, 60, 60)}
 PATH_COLOR, CAMERA_COLOR, KEYFRAME_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (120, 90, 200), (255, 200, 0)
 CAMERA_SIZE, KEYFRAME_SIZE = 0.25, 0.08
-"""Lengths of the pyramids that stand for the camera and the keyframes, metres."""
+"""Lengths of camera and keyframe pyramids, metres."""
 LAYERS = {
     "map": "map", "path": "trajectory", "camera": "camera", "labels": "labels",
     "movers": "moving objects", "keyframes": "keyframes",
 }  # fmt: skip
-"""First part of the names of nodes in the scene to the name of their switch."""
 MEASURE = "click on the map for a point, again for a distance"
 
 
 class Window:
-    """The page; safe to use from several threads.
+    """The page; thread-safe.
 
     Args:
-        host: Address to serve at; 127.0.0.1 for this machine only.
-        token: Secret part of the address; None generates one unless ``host`` is this machine only.
+        host: 127.0.0.1 for this machine only.
+        token: Secret; None generates one unless ``host`` is this machine.
 
     Raises:
         MissingExtraError: viser is not installed.
@@ -85,7 +84,7 @@ class Window:
             self._camera = camera
 
     def stay(self) -> None:
-        """Show single frames instead of the latest one."""
+        """Show single frames, not the latest."""
         self._follow.value = False
 
     def clear(self) -> None:
@@ -117,7 +116,7 @@ class Window:
                     self._add(_mesh_name(key), "add_glb", file)
 
     def add_frames(self, frames: list[FrameFigures], poses: dict[float, NDArray] | None = None) -> None:
-        """Append frames; ``poses`` (4, 4) by time replace poses of earlier frames after a correction."""
+        """Append frames; ``poses`` (4, 4) by time replace corrected ones."""
         with self._lock:
             self._frames += frames
             if poses is not None:
@@ -134,7 +133,7 @@ class Window:
                 self.show_frame(len(self._frames) - 1)
 
     def show_change(self, change: dict[str, Any]) -> None:
-        """Show the box of a change since an earlier visit, an object of changes.jsonl."""
+        """Show the box of a change, an object of changes.jsonl."""
         with self._lock:
             low, high = np.array(change["box"])
             name, middle = f"/changes/{change['id']}", (low + high) / 2
@@ -147,7 +146,7 @@ class Window:
             self._add(f"{name}/label", "add_label", text=f"{change['id']}: {change['kind']}", position=middle)
 
     def add_images(self, timestamp: float, files: dict[str, bytes]) -> None:
-        """Add JPEG files of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
+        """Add JPEG files of a frame by ``KINDS``; shown while following the run."""
         with self._lock:
             self._images[timestamp] = files
             if len(self._images) > MAX_IMAGES:
@@ -189,7 +188,7 @@ class Window:
             self._add("/keyframes", "add_line_segments", points=points, colors=KEYFRAME_COLOR, thickness=0.004)
 
     def mark(self, origin: "ArrayLike", direction: "ArrayLike") -> None:
-        """Mark the point of the map on a ray; a second one gives the distance, a third one begins again."""
+        """Mark the map point on a ray; a second gives the distance, a third begins again."""
         with self._lock:
             if not self._layers["map"].value:
                 return
@@ -274,7 +273,6 @@ class Window:
         self._add("/camera", "add_camera_frustum", **look, **place)
 
     def _draw_in_camera(self) -> None:
-        """Show the image in the camera: with the labels, or without them."""
         if "/camera" in self._handles:
             kind = "mask" if self._layers["labels"].value else "color"
             self._handles["/camera"].image = self._pictures[kind].image

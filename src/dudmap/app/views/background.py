@@ -1,4 +1,4 @@
-"""Render the background behind dynamic objects: depth from the map, colour from other frames."""
+"""Render the background behind dynamic objects: map depth, other frames' colour."""
 
 from dataclasses import dataclass
 
@@ -12,16 +12,15 @@ from dudmap.core.geometry.lens import Lens, OtherView
 from dudmap.core.map.volume import TsdfVolume
 
 SAMPLES = 5
-"""Other frames whose median colour is used; two of them may show a dynamic object."""
+"""Frames whose median colour is used; two may show a dynamic object."""
 TRIES = 24
-"""Most other frames, nearest first, that are searched for a pixel."""
+"""Frames, nearest first, searched for a pixel."""
 TOLERANCE = 0.03
-"""Largest relative difference of depths of one surface: two standard deviations at 4 m (0.8 %), and as much for the
-map."""
+"""Relative difference of depths of one surface: two standard deviations at 4 m (0.8 %), and as much for the map."""
 ANGLE_LENGTH = 2.0
-"""Length equivalent to a rotation by one radian, metres: the depth of a room."""
+"""Length of a rotation by one radian, metres: a room's depth."""
 LEAST_PIXELS = 500
-"""Fewest pixels that determine the exposure of a frame."""
+"""Fewest pixels for the exposure of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +29,9 @@ class Source:
 
     Attributes:
         color: (h, w, 3) uint8, of the colour camera.
-        depth: (h, w) float32, metres, of the map from the same pose; 0 at dynamic pixels and where the frame differs.
+        depth: (h, w) float32, metres, of the map; 0 at dynamic pixels and differences.
         T_world_color: (4, 4) pose of the colour camera.
-        gain: (3,) of its colours against the map's.
+        gain: (3,) of its colours over the map's.
     """
 
     color: NDArray[np.uint8]
@@ -45,7 +44,7 @@ class BackgroundRenderer:
     """Renders the static scene behind dynamic objects in the frames of a recording.
 
     Args:
-        registered: Whether the pixels of both images correspond.
+        registered: Whether both images' pixels correspond.
     """
 
     def __init__(
@@ -63,7 +62,7 @@ class BackgroundRenderer:
         T_world_camera: NDArray[np.float64],
         T_world_color: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Map moving pixels (H, W) of the depth image to the colour image (h, w)."""
+        """Moving pixels (H, W) of depth, in the colour image (h, w)."""
         if self.other is None:
             return moving
         return self.other.mask(moving, frame.depth, se3.inverse(T_world_color) @ T_world_camera)
@@ -75,7 +74,7 @@ class BackgroundRenderer:
         T_world_camera: NDArray[np.float64],
         T_world_color: NDArray[np.float64],
     ) -> None:
-        """Add a frame as a source of colours, without its moving pixels (h, w)."""
+        """Add a source of colours, without moving pixels (h, w)."""
         color, depth = self._map_in_color(T_world_color)
         seen = frame.depth
         if self.other is not None:
@@ -87,10 +86,7 @@ class BackgroundRenderer:
     def colors(
         self, frame: Frame, wanted: NDArray[np.bool_], T_world_color: NDArray[np.float64]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Background colours (h, w, 3) at the wanted pixels (h, w) of a frame's colour image, in its exposure.
-
-        Also returns which colours are known (h, w).
-        """
+        """Background colours (h, w, 3) at wanted pixels (h, w), in the frame's exposure, and which are known (h, w)."""
         of_map, distances = self._map_in_color(T_world_color)
         gain = exposure_gain(frame.rgb, of_map, (distances > 0) & ~wanted)
         rows, columns = np.nonzero(wanted & (distances > 0))
@@ -103,12 +99,11 @@ class BackgroundRenderer:
         return color, known
 
     def map_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (H, W) of the map in the depth camera, metres, 0 = unknown."""
+        """Map depth (H, W) in the depth camera, metres, 0 = unknown."""
         rendered = self.volume.raycast(T_world_camera, self.depth_lens.straight).depth
         return self.depth_lens.distorted(rendered, nearest=True)
 
     def _map_in_color(self, T_world_color: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colour (h, w, 3) and depth (h, w) of the map in the colour camera."""
         result = self.volume.raycast(T_world_color, self.color_lens.straight)
         return self.color_lens.distorted(result.color), self.color_lens.distorted(result.depth, nearest=True)
 
@@ -119,7 +114,7 @@ class BackgroundRenderer:
         distances: NDArray[np.float32],
         T_world_color: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Colours (n, 3) of pixels in other frames, in the map's exposure; and which were found (n,)."""
+        """Colours of pixels in other frames, map exposure, and which were found."""
         from scipy.ndimage import map_coordinates
 
         points = self.color_lens.points(rows, columns, distances.astype(np.float64))
@@ -153,7 +148,6 @@ class BackgroundRenderer:
 
 
 def _inner(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose neighbours are all seen: map colours fade into black at borders."""
     import cv2
 
     return cv2.erode(seen.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -168,10 +162,8 @@ def _nearest_pixels(image: NDArray[np.float32], uv: NDArray[np.float32]) -> NDAr
 def exposure_gain(
     image: NDArray[np.uint8], rendered: NDArray[np.uint8], used: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Gains (3,) of an image's colours over map colours; 1 if too few pixels are valid.
-
-    Each is the median over pixels that are neither dark nor saturated.
-    """
+    """Gains (3,) of an image over map colours; 1 with too few pixels. Medians over pixels neither dark nor
+    saturated."""
     gains = np.ones(3)
     for channel in range(3):
         a, b = image[..., channel], rendered[..., channel]
@@ -182,8 +174,7 @@ def exposure_gain(
 
 
 def continued(color: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Fill unknown colours (H, W, 3) smoothly, without edges, by a pyramid of weighted means (pull-push, Gortler et
-    al. 1996)."""
+    """Fill unknown colours (H, W, 3) smoothly by weighted means (pull-push, Gortler et al. 1996)."""
     if known.all() or not known.any():
         return color
     import cv2

@@ -20,21 +20,20 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 MARGIN = 6 / 640
-"""Width by which masks grow, share of the image width: blur, mixed pixels and disparity window."""
+"""Growth of masks, share of the width: blur, mixed pixels, disparity window."""
 REACH = 24 / 640
-"""Largest distance from a mask, share of the width, of added pixels in front of the map."""
+"""Distance from a mask, share of the width, of added pixels in front of the map."""
 IN_FRONT = 0.04
-"""Share by which a measurement is in front of the map: 2.5 standard deviations of a Kinect at 5 m (0.0012 m + 0.0019
-(z - 0.4)^2)."""
+"""Share in front of the map: 2.5 standard deviations of a Kinect at 5 m (0.0012 m + 0.0019 (z - 0.4)^2)."""
 SHADOW = 48 / 640
-"""Largest width of the projector's shadow, share of the image width: 0.075 m * 525 / 0.8 m for a Kinect."""
+"""Width of the projector's shadow, share of the width: 0.075 m * 525 / 0.8 m."""
 LEFT_OVER = 5.0
-"""A pixel near a mask is dynamic if its colour differs by this many standard deviations (1.48 median absolute
-deviations). This finds feet on the floor."""
+"""Colour difference of dynamic pixels near a mask, standard deviations (1.48 median absolute deviations): feet on the
+floor."""
 LEAST_DIFFERENCE = 40.0
-"""Smallest such difference, of 255; shadows and exposure cause smaller ones."""
+"""Smallest such difference, of 255, above shadows and exposure."""
 SOURCES = 150
-"""Most frames that provide colours, evenly spread; one of 640x480 pixels takes 2 MB."""
+"""Frames that provide colours, evenly spread; each takes 2 MB."""
 
 
 class Cleaned(NamedTuple):
@@ -42,10 +41,10 @@ class Cleaned(NamedTuple):
 
     Attributes:
         moving: (h, w) bool, replaced pixels of the colour image.
-        replaced: (H, W) bool, replaced pixels of the depth image: moving pixels and their shadows.
-        color: (h, w, 3) uint8; unknown pixels continue the known ones smoothly.
+        replaced: (H, W) bool, replaced depth pixels, with shadows.
+        color: (h, w, 3) uint8; unknown pixels continue the known.
         depth: (H, W) float32, metres, 0 = unknown.
-        known: (h, w) bool, whether the colour is known.
+        known: (h, w) bool, known colours.
     """
 
     frame: Frame
@@ -58,10 +57,7 @@ class Cleaned(NamedTuple):
 
 @dataclass(frozen=True)
 class CleanReport:
-    """Result of ``clean``.
-
-    Attributes:
-    """
+    """Result of ``clean``."""
 
     frames: int
     left_out: tuple[int, ...]
@@ -70,16 +66,14 @@ class CleanReport:
 
 
 class Cleaner:
-    """Replaces dynamic objects in the frames of a recording, given a run over it with map and masks.
+    """Replaces dynamic objects in a recording, given a run over it with map and masks.
 
     Attributes:
-        indices: Numbers of the frames that have a pose and a mask.
+        indices: Frames with pose and mask.
         registered: Whether the pixels of depth and colour images correspond.
 
     Raises:
-        DatasetError: The run has no masks, its poses do not belong to the recording, or it lacks the pose of the colour
-            camera.
-        MapError: There is no map.
+        DatasetError: No masks, poses of another recording, or no pose of the colour camera.
     """
 
     def __init__(self, run: RunContent, sequence: "Sequence") -> None:
@@ -139,7 +133,7 @@ class Cleaner:
 
 
 def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
-    """Mask (H, W) dilated by a disk with a radius of ``width`` pixels, at least one."""
+    """Mask (H, W) dilated by ``width`` pixels, at least one."""
     import cv2
 
     radius = max(1, round(width))
@@ -148,7 +142,7 @@ def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
 
 
 def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask (H, W) plus pixels of ``others`` that are connected with it."""
+    """Mask (H, W) plus connected pixels of ``others``."""
     import cv2
 
     _, pieces = cv2.connectedComponents((mask | others).astype(np.uint8), connectivity=8)
@@ -159,8 +153,7 @@ def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.
 def with_shadow(
     moving: NDArray[np.bool_], depth: NDArray[np.float32], behind: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Mask (H, W) plus connected pixels without depth and with known background depth (H, W): shadows of the
-    projector."""
+    """Mask (H, W) plus connected pixels without depth before known background (H, W): projector shadows."""
     return connected(moving, grown(moving, SHADOW * moving.shape[1]) & (depth == 0) & (behind > 0))
 
 
@@ -170,12 +163,8 @@ def unlike(
     where: NDArray[np.bool_],
     surely: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of an image (h, w, 3) whose colours differ unusually from the expected ones; tested are pixels
-    ``where``.
-
-    The usual difference comes from tested pixels that ``surely`` show the expected surface, else from all. Single
-    pixels and lines are discarded: edges may be off by a pixel.
-    """
+    """Pixels (h, w) whose colours (h, w, 3) differ unusually from the expected; tested: ``where``; the spread is that
+    of ``surely``, else of all. Single pixels and lines are discarded."""
     import cv2
 
     judged = where if surely is None or not (where & surely).any() else where & surely
@@ -196,19 +185,18 @@ def clean_recording(
     progress: "Callable[[int, int], None] | None" = None,
     max_frames: int | None = None,
 ) -> CleanReport:
-    """Write the recording without dynamic objects, in TUM layout, into a new or empty folder: rgb/ and depth/ with
-    their lists, associations.txt, intrinsics.txt, groundtruth.txt if known, and
+    """Write the recording without dynamic objects, in TUM layout, into an empty folder: rgb/, depth/, lists,
+    associations.txt, intrinsics.txt, groundtruth.txt if known, and
 
     - trajectory.txt, the poses of the run.
     - replaced/ with replaced.txt: 255 = replaced pixels.
-    - unknown/ with unknown.txt: 255 = pixels whose background no frame saw. Their depth is 0; their colour continues
-      the surroundings.
+    - unknown/ with unknown.txt: 255 = background that no frame saw: depth 0, colour of the surroundings.
 
-    A separate colour camera keeps its geometry, which intrinsics.txt holds; replaced_color/ and unknown_color/ are its
-    masks. ``progress`` receives the numbers of finished and of all frames.
+    A separate colour camera keeps its geometry (intrinsics.txt), with masks replaced_color/ and unknown_color/.
+    ``progress`` receives the numbers of finished and all frames.
 
     Raises:
-        DatasetError: The folder is not empty, or run and recording do not match.
+        DatasetError: The folder is not empty, or run and recording differ.
         MapError: There is no map.
         OSError: A file cannot be written.
     """

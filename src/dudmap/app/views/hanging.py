@@ -1,4 +1,4 @@
-"""Small pieces of a map that hang in the air: remains of dynamic objects."""
+"""Small pieces that hang in the air: remains of dynamic objects."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,13 +8,13 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.io.exporting.mesh_editing import face_areas
 
 LARGEST = 25e-4
-"""Surface of the largest removed piece, square metres; larger ones may be lamps."""
+"""Largest removed piece, square metres; larger ones may be lamps."""
 GAP = 0.02
-"""Least distance from any larger piece, metres; nearer pieces are cut off by a voxel or two."""
+"""Distance from any larger piece, metres, beyond cuts of a voxel or two."""
 
 
 def remove_hanging_pieces(volume: TsdfVolume, mesh: Mesh) -> None:
-    """Make the voxels around the mesh's hanging pieces unknown, for views of a map with one voxel size."""
+    """Make voxels around hanging pieces unknown, in a map with one voxel size."""
     vertices = mesh.vertices[hanging(mesh)]
     offsets = np.stack(np.meshgrid(*3 * [np.arange(-1, 3)], indexing="ij"), axis=-1).reshape(-1, 1, 3)
     voxels = np.unique((np.floor(vertices / volume.voxel_size).astype(np.int32) + offsets).reshape(-1, 3), axis=0)

@@ -1,4 +1,4 @@
-"""Artificial views (thesis section 4.5): render the map along a trajectory, as picture, video or recording."""
+"""Artificial views (thesis section 4.5) along a trajectory, as picture, video or recording."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,21 +20,21 @@ from dudmap.io.exporting.mesh_editing import without_small_pieces
 from dudmap.io.exporting.run_content import RunContent
 
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
-"""Codec by file suffix: VP9 plays in browsers (0.1 s per frame), MPEG-4 in desktop players (3 ms)."""
+"""Codec by suffix: VP9 for browsers (0.1 s per frame), MPEG-4 for desktop players (3 ms)."""
 PICTURE = ".png"
 """Suffix of a single picture."""
 SIZE = (1280, 720)
 """Width and height of views of the whole map, pixels."""
 NEAREST, EDGE, BEYOND = 0.3, 0.04, 0.005
-"""Least distance of an orbit's camera from the map (metres), margin of its pictures as a share of half their size, and
-share of the surface beyond each side of a picture, so that a picture holds 98 %."""
+"""Distance of an orbit's camera from the map (metres), picture margin (share of half the size), and share of the
+surface beyond each side."""
 SAMPLES = 20_000
-"""Points that stand for the surface: 100 of them lie beyond each side of a picture."""
+"""Points of the surface: 100 beyond each side."""
 EMPTY = 32
 
 
 class TumFolder:
-    """Writes a folder of PNG files per kind of image, and a list per kind whose first line is a title."""
+    """Writes PNG files and a list with a title per kind of image."""
 
     def __init__(self, out: Path, title: str, kinds: Iterable[str]) -> None:
         self._out, self._title = out, title
@@ -43,14 +43,14 @@ class TumFolder:
             (out / kind).mkdir(parents=True, exist_ok=True)
 
     def add(self, kind: str, timestamp: float, image: NDArray) -> str:
-        """Write an image and return its line of the list: (H, W, 3) uint8 RGB, (H, W) uint16, or (H, W) bool."""
+        """Write an image, (H, W, 3) uint8 RGB, (H, W) uint16 or bool; return its line of the list."""
         line = f"{timestamp:.6f} {kind}/{timestamp:.6f}.png"
         write_image(self._out / line.split()[1], image, sync=False)
         self._lines[kind].append(line)
         return line
 
     def finish(self, camera: Camera, associations: Iterable[str] = (), more: Iterable[str] = ()) -> None:
-        """Write the lists and intrinsics.txt: the lines of the depth camera, then ``more`` lines."""
+        """Write lists and intrinsics.txt: the depth camera, then ``more`` lines."""
         lists = self._lines | ({"associations": list(associations)} if associations else {})
         for name, lines in lists.items():
             write_text(self._out / f"{name}.txt", "\n".join([f"# {self._title}", *lines]) + "\n")
@@ -66,17 +66,17 @@ def camera_lines(camera: Camera) -> list[str]:
 
 
 def depth_units(depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint16]:
-    """Depth in the units of a camera's images; 0 if it exceeds 16 bits."""
+    """Depth in a camera's units; 0 beyond 16 bits."""
     units = np.rint(depth * camera.depth_scale)
     return np.where(units > 65535, 0, units).astype(np.uint16)
 
 
 @contextmanager
 def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
-    """Write a video of a size (width, height); yield a function that adds an RGB image (H, W, 3).
+    """Write a video (width, height); yield a function that adds an RGB image (H, W, 3).
 
     Raises:
-        ConfigError: The suffix is unknown, or this OpenCV cannot write the format.
+        ConfigError: An unknown suffix, or OpenCV cannot write it.
     """
     codec = CODECS.get(path.suffix.lower())
     if codec is None:
@@ -101,10 +101,10 @@ def video_file(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callab
 def orbit(
     run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float, camera: Camera
 ) -> Trajectory:
-    """Trajectory on an arc around the mesh, 27 degrees above, as near as 98 % of the surface stay visible.
+    """Trajectory on an arc around the mesh, 27 degrees above, that keeps 98 % of the surface visible.
 
-    The arc is centred on the side of the recording cameras. It spans ``sweep_deg``, there and back; 360 or more gives a
-    circle. ``up`` (3,) is a unit vector against gravity.
+    Centred on the recording cameras' side; spans ``sweep_deg``, there and back; 360 gives a circle. ``up`` (3,): unit
+    vector against gravity.
     """
     large = without_small_pieces(run.surface)
     points = _spread(large if len(large.faces) else run.surface)
@@ -132,7 +132,6 @@ def orbit(
 
 
 def _spread(mesh: Mesh) -> NDArray[np.float64]:
-    """Points (n, 3) of a mesh, each for the same area."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
     if len(area) == 0 or area[-1] == 0:
@@ -144,11 +143,8 @@ def _spread(mesh: Mesh) -> NDArray[np.float64]:
 def _framing(
     points: NDArray[np.float64], back: NDArray[np.float64], up: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.float64], float]:
-    """Pose (4, 4) of a camera that looks against ``back`` and just sees 98 % of the points (n, 3), and its distance.
-
-    A camera at (cx, cy, cz) sees (x, y, z), in camera axes, if |x - cx| <= r (z - cz), r the tangent of half the view;
-    likewise for y. ``BEYOND`` of the points break each of these four rules; points behind the camera break one too.
-    """
+    """Pose of a camera that looks against ``back`` and just sees 98 % of the points, ``BEYOND`` of them beyond each
+    side, and its distance."""
     forward = -back / np.linalg.norm(back)
     right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
     T = np.eye(4)
@@ -174,14 +170,13 @@ def render_run(
     progress: Callable[[int, int], None] | None = None,
     whole: bool = False,
 ) -> int:
-    """Render the map along a trajectory; return the number of frames.
+    """Render the map along a trajectory; return the frames' number.
 
-    The suffix of ``out`` selects the output: .png a picture from the first pose, another known suffix a video. Without
-    a suffix it is a folder for a recording in TUM layout: rgb/, depth/ and their lists, intrinsics.txt and
-    groundtruth.txt.
+    ``out``: .png a picture from the first pose, another known suffix a video, none a recording in TUM layout: rgb/,
+    depth/, lists, intrinsics.txt, groundtruth.txt.
 
     Args:
-        whole: Render to the far end of the map, not only to the depth range of the run.
+        whole: Render to the far end of the map, beyond the run's depth range.
 
     Raises:
         ConfigError: The suffix is unknown.
@@ -227,7 +222,7 @@ def render_run(
 
 
 def wide_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Camera with square pixels and the vertical field of view of another one, for images of (width, height)."""
+    """Camera with square pixels and another's vertical field of view, for images (width, height)."""
     (width, height), focal = size, camera.fy * size[1] / camera.height
     return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, depth_scale=camera.depth_scale)
 

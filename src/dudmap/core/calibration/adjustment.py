@@ -16,11 +16,11 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 
 MAX_ANGLE, MIN_ANGLE = np.radians(30), np.radians(2)
-"""Limits of the rotation between the frames of a pair, radians: it separates both cameras and leaves overlap."""
+"""Rotation limits between the frames of a pair, radians: separation of both cameras, and overlap."""
 MIN_FASTER = 0.2
 """Smallest velocity difference (m/s, rad/s) of a pair without rotation or translation."""
 MAX_SHIFT = 0.35
-"""Largest translation between the frames of a pair over the median depth."""
+"""Largest translation between the frames over the median depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,18 +32,18 @@ class Pair:
 
 
 class PairSet:
-    """Pairs of F frames, with images and points (every ``stride``-th) stacked for the kernel.
+    """Pairs of F frames; images and points (every ``stride``-th) stacked for the kernel.
 
     Attributes:
-        numbers: (P, 2) int64, first and second frame of every pair, in order of time.
+        numbers: (P, 2) int64 frames of every pair, in order of time.
         Ts_camera_world: (F, 4, 4) tracked poses.
         depths: (F, h, w) float32; ``images``: (F, h, w) float32 filtered intensities per size, coarse to fine;
-            ``brightness``: (F, h, w) float32 unfiltered intensities of the smallest size.
+            ``brightness``: (F, h, w) float32 unfiltered, smallest size.
         points, tangents: (n, 3) and (n, 6) float32 of all frames; ``starts``: (F + 1,) start of each frame in them.
-        residual_starts: (P + 1,) start of each pair's residuals: one per point of its first frame.
+        residual_starts: (P + 1,) start of each pair's residuals, one per point of its first frame.
         twists: (F, 6) float32 velocities; ``color_offsets``: (F,) float32.
         places: (P, 25) indices of each pair's unknowns: parameters, poses of both frames. ``products``: (P n n,) flat
-            indices of the products of n unknowns per pair, keyed by the first of these unknowns.
+            indices of their products, by the first unknown.
     """
 
     def __init__(self, pairs: Sequence[Pair], stride: int = 1) -> None:
@@ -115,30 +115,29 @@ def standard_error(values: NDArray[np.float64], numbers: NDArray[np.int64]) -> f
 
 
 PRIOR_SIGMA = np.array([0.03, 0.015, 0.005] + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
-"""Prior standard deviations of an unknown camera, in the units of ``PARAMETERS``; of the principal point as a share of
-the width. Colour cameras are 15 to 32 mm from depth cameras, mostly sideways. Focal lengths differ by up to 10 %; a
-frame at 30 Hz takes 33 ms."""
+"""Prior standard deviations of an unknown camera, in units of ``PARAMETERS`` (principal point: share of the width): 15
+to 32 mm from the depth camera, focal lengths within 10 %, 33 ms per frame."""
 POSE_SIGMA = np.array([0.02] * 3 + [np.radians(1)] * 3)
-"""Standard deviation of a tracked pose, metres and radians, for directions that the images do not observe."""
+"""Standard deviation of a tracked pose, metres and radians, in unobserved directions."""
 LIGHT_SIGMA = np.array([0.3, 0.1])
 """Standard deviations of gain and offset between two images."""
 CORRELATED = 50.0
 """Neighbouring points with correlated errors that count as one against the priors."""
 COST_SCALES = (0.01, 1.0)
-"""Fixed standard deviations of intensity (0..1) and depth differences (over sigma(z)) in the cost of a pair; 0.01 is
-the noise of common cameras."""
+"""Fixed standard deviations of intensity (0..1, common cameras) and depth differences (over sigma(z)) in the cost of a
+pair."""
 FIRST_SCALES, LEAST_SCALE = (0.05, 1.0), 1e-3
-"""Initial standard deviations of an adjustment, which estimates them, and the lower bound of both."""
+"""Initial standard deviations of an adjustment, and the lower bound of both."""
 HUBER = 1.345
 """Constant of the robust weight, standard deviations: 95 % efficiency for Gaussian errors."""
 ITERATIONS, COARSE_ITERATIONS = 6, 4
-"""Largest number of Gauss-Newton steps at the largest image size, and at each smaller one."""
+"""Gauss-Newton steps at the largest image size, and at smaller ones."""
 STEADY = 2
-"""Consecutive small steps for convergence: poses follow later."""
+"""Consecutive small steps for convergence."""
 FIT_ITERATIONS = 3
 """Steps per image size that fit poses to a known calibration."""
 CONVERGED, CONVERGED_COARSE = 0.01, 0.1
-"""Step of every parameter in prior standard deviations at convergence, at the largest image size and smaller ones."""
+"""Step in prior standard deviations at convergence, largest size and smaller ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +163,7 @@ class Fit:
     def moved(
         self, pairs: PairSet, step: NDArray[np.float64], parts: "_PairSystems", scales: tuple[float, float]
     ) -> "Fit":
-        """State after a step (13 + 6 F,) of parameters and poses, with the implied step of gains and offsets."""
+        """State after a step (13 + 6 F,) of parameters and poses."""
         return Fit(
             self.calibration.retract(step[:NUM_PARAMETERS]) if step[:NUM_PARAMETERS].any() else self.calibration,
             se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world,
@@ -175,11 +174,10 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class _PairSystems:
-    """Normal equations of all pairs, each with its gain and offset eliminated.
+    """Normal equations of all pairs without gain and offset.
 
     Attributes:
-        H, b: (P, n, n) and (P, n) in the parameters and the poses of both frames, n = 25, or in the poses alone for a
-            known calibration, n = 12.
+        H, b: (P, n, n) and (P, n) in parameters and both poses, n = 25, or in the poses alone, n = 12.
         light_slope, light_step: (P, 2, n) and (P, 2): the step of gain and offset is -(light_step + light_slope step).
         residuals: (2, n) of all pairs, see ``linearize_pair``.
     """
@@ -197,14 +195,11 @@ class _PairSystems:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations (13 + 6 F), or of the poses (6 F), of all pairs with all priors."""
-
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     parts: _PairSystems
 
     def step(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Gauss-Newton step (13 + 6 F,) in all poses and in the ``free`` parameters."""
         begin, out = self.parts.begin, np.zeros(len(self.b) + self.parts.begin)
         moves = np.concatenate([free, np.ones(len(out) - NUM_PARAMETERS, dtype=bool)])
         known = moves[begin:]
@@ -215,9 +210,8 @@ class _System:
 class Adjustment:
     """Robust Gauss-Newton over the calibration, the poses of the frames, and the light of the pairs.
 
-    Poses belong to frames: all pairs of a frame determine its pose, and so the translation between the cameras, which
-    resembles a pose error most. ``given`` is the initial calibration, the mean of the priors. ``levels`` are the
-    halvings of the colour images, coarse to fine.
+    All pairs of a frame determine its pose, and so the translation between the cameras, which resembles a pose error.
+    ``given``: initial calibration, mean of the priors. ``levels``: halvings of the colour images, coarse to fine.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig) -> None:
@@ -231,8 +225,7 @@ class Adjustment:
     def solve(
         self, pairs: PairSet, start: Fit, free: NDArray[np.bool_], levels: Sequence[int] = ()
     ) -> tuple[Fit, NDArray[np.float64]]:
-        """Fit of the ``free`` parameters (13,) bool, coarse to fine, and the covariance (13, 13) with all parameters
-        free."""
+        """Fit of the ``free`` parameters (13,) bool, and the covariance (13, 13) of all."""
         fit, system = start, None
         levels = levels or self.levels
         for level in levels:
@@ -249,10 +242,9 @@ class Adjustment:
         return fit, self._covariance(pairs, system, int(np.count_nonzero(free)))
 
     def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
-        """Fit of the poses alone to the calibration of ``start``, and the last residuals (2, n).
+        """Fit of the poses alone, and the last residuals (2, n).
 
-        ``levels``: image sizes, all by default. Fine images suffice if the poses were fitted to nearly this
-        calibration.
+        ``levels``: image sizes, all by default. Fine images suffice near the fitted calibration.
         """
         fit, residuals = start, np.empty((2, 0), np.float32)
         for level in levels or self.levels:
@@ -263,8 +255,7 @@ class Adjustment:
         return replace(fit, scales=new_scales(residuals, COST_SCALES)), residuals
 
     def costs(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> NDArray[np.float64]:
-        """Mean robust costs (2, P) of intensities and depths of all pairs, with poses fitted to the calibration of
-        ``start``; see ``with_poses``."""
+        """Mean robust costs (2, P) of intensities and depths, with fitted poses; see ``with_poses``."""
         _, residuals = self.with_poses(pairs, start, levels)
         scaled = np.abs(residuals) / np.array(COST_SCALES, np.float32)[:, None]
         robust = np.where(scaled < HUBER, scaled * scaled, HUBER * (2 * scaled - HUBER))
@@ -336,7 +327,7 @@ def _without_light(
     """Normal equations of all pairs without gain and offset.
 
     ``H``, ``b``: (P, 21, 21), (P, 21) of ``linearize_pair``. ``light``: (P, 2) gains and offsets. ``Ts``: (P, 4, 4)
-    second camera from first. ``begin``: first unknown; the parameters before it are known.
+    second camera from first. ``begin``: first unknown parameter.
     """
     known, of_light, own = slice(begin, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), SHARED - begin
     prior = CORRELATED * LIGHT_SIGMA**-2

@@ -1,4 +1,4 @@
-"""Rolling shutter of the depth camera: readout time of its rows, estimated from pairs of frames."""
+"""Rolling shutter of the depth camera: readout time of its rows, from pairs of frames."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from dudmap.core.geometry.calibration import Calibration
 STEP = 0.02
 """Initial readouts of the search besides 0, in both directions, seconds: sensors at 30 Hz take 10 to 33 ms."""
 LONGEST = 0.05
-"""Longest plausible readout at low frame rates, seconds; at higher ones it is the interval between frames."""
+"""Longest plausible readout at low frame rates, seconds; at higher ones the frame interval."""
 
 
 def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe:
@@ -32,21 +32,19 @@ def rectified_keyframe(keyframe: ColorKeyframe, readout: float) -> ColorKeyframe
 
 
 class ReadoutSearch:
-    """Mean robust cost of the pairs of one half of the time, as a function of the depth readout.
+    """Mean robust cost of the pairs of one half of the time over the depth readout.
 
-    Delay and readout of the colour camera, and the poses, are fitted to each readout. The minimum is found by a
-    parabola through three readouts and a second one through the nearest three. No readout exceeds the interval between
-    frames.
+    Delay and readout of the colour camera, and poses, are fitted to each readout; two parabolas through three readouts
+    give the minimum. No readout exceeds the frame interval.
 
     Args:
         free: (13,) bool, the timing parameters.
-        stride: Step through the points of a keyframe.
 
     Attributes:
         given: Calibration with the given readout and its fitted timing.
-        best: Calibration with the readout of the smallest cost.
-        sigma: Standard deviation of this readout, seconds: a sandwich of the slopes of all pairs' costs. Without a
-            minimum it is the standard deviation of a uniform distribution up to the longest readout.
+        best: Calibration with the best readout.
+        sigma: Its standard deviation, seconds: a sandwich of the slopes of the pairs' costs; without a minimum that of
+            a uniform distribution.
     """
 
     def __init__(
@@ -71,13 +69,13 @@ class ReadoutSearch:
         self.sigma = min(error / bend.sum(), unknown) if bend.sum() > 0 else unknown
 
     def _fitted(self, readout: float) -> tuple[NDArray[np.float64], Calibration]:
-        """Costs (P,) of every pair for a readout in seconds, and the calibration with fitted timing."""
+        """Costs (P,) for a readout in seconds, and the calibration with fitted timing."""
         pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
         fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, self._adjustment.levels[-2:])
         return self._adjustment.costs(pairs, fit).sum(axis=0), fit.calibration
 
     def costs(self, calibration: Calibration) -> NDArray[np.float64]:
-        """Costs (2, P) of intensities and depths of every pair for a calibration, such as one from other pairs."""
+        """Costs (2, P) of intensities and depths for a calibration."""
         pairs = self._rectified(calibration.depth_readout)
         fit, _ = self._adjustment.with_poses(pairs, Fit.tracked(pairs, calibration))
         return self._adjustment.costs(pairs, fit, self._adjustment.levels[-1:])

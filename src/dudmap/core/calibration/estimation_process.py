@@ -1,6 +1,6 @@
-"""Estimation of a calibration in a separate process: a thread would hold the interpreter lock and delay frames.
+"""Estimation of a calibration in a separate process, because a thread would hold the interpreter lock.
 
-Objects are pickled as in ``multiprocessing``, which itself would run the user's main module again in the child.
+``multiprocessing`` itself would run the user's main module again.
 """
 
 import os
@@ -23,11 +23,11 @@ LOWEST = 19
 
 
 class CalibrationProcessWarning(UserWarning):
-    """The separate process failed; the estimation runs in this process and delays the frames."""
+    """The separate process failed; the estimation in this process delays the frames."""
 
 
 def estimate_beside(estimator: CalibrationEstimator, keyframes: Sequence[ColorKeyframe]) -> "Future[Estimate]":
-    """Future of ``estimator.estimate(keyframes)``, computed in a separate process, or in a thread if that fails."""
+    """Future of ``estimator.estimate(keyframes)`` in a separate process, or in a thread if that fails."""
     future: Future[Estimate] = Future()
 
     def work() -> None:
@@ -48,7 +48,6 @@ def estimate_beside(estimator: CalibrationEstimator, keyframes: Sequence[ColorKe
 def _in_other_process(
     estimator: CalibrationEstimator, keyframes: Sequence[ColorKeyframe]
 ) -> tuple[Estimate | None, str]:
-    """The estimate, or None and the reason of the failure."""
     environment = os.environ | {"DUDMAP_THREADS": "1"}
     command, pipe = [sys.executable, "-m", __name__], subprocess.PIPE
     try:

@@ -28,26 +28,25 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "center": ("center_x", "center_y"),
     "geometry": (*PARAMETERS[:6], "log_focal", "center_x", "center_y"),
 }
-"""Parameters that leave their given values together. A translation resembles a rotation, but only both explain near
-and far colours. The principal point is also tested alone: a few seconds determine two parameters but not nine."""
+"""Parameters that leave their given values together."""
 TESTED = GROUPS | {"vignetting": ("vignetting",)}
-"""All tested and reported groups; vignetting moves no pixel, and is estimated after the others."""
+"""All tested groups; vignetting is estimated after the others."""
 MIN_PAIRS = 14
-"""Smallest number of pairs in each half of the time: one more than parameters."""
+"""Pairs in each half of the time: one more than parameters."""
 PAIRS = 80
-"""Pairs that decide which groups are estimated; the result uses half as many more."""
+"""Pairs that decide about groups; the result uses half as many more."""
 SHUTTER_PAIRS = 160
-"""Number of pairs that decide on the depth readout, which only turning cameras show clearly."""
+"""Pairs that decide about the depth readout."""
 STRIDE = 2
-"""Step through the points of a frame for these decisions; the result uses all points."""
+"""Step through the points of a frame for these decisions."""
 SHUTTER, SHUTTER_PARAMETER = "shutter", "depth_readout"
-"""Group of the depth readout, which is estimated before all others, and the name of its parameter."""
+"""Group of the depth readout, estimated before all others, and its parameter."""
 MATERIAL = {"timing": 0.01, "lens": 0.01, "center": 0.01, "geometry": 0.1, SHUTTER: 0.01}
-"""Smallest relative decrease of the cost per group. A bent depth image, as of a Kinect, resembles a displaced colour
-camera. Measured: it lets the geometry gain up to 7 %, a camera 25 mm away 19 to 30 %."""
+"""Smallest relative decrease of the cost per group. It lets the geometry gain up to 7 %, a camera 25 mm away 19 to 30
+%."""
 EVIDENCE = 3.0
-"""Smallest decrease of the cost for a group, standard errors, of estimates on each half of the time tested on the
-other. Chance exceeds it once in 700 times."""
+"""Smallest decrease of the cost for a group, standard errors, of estimates on one half of the time tested on the other.
+Chance exceeds it once in 700 times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,10 +54,10 @@ class Estimate:
     """Result of an estimation.
 
     Attributes:
-        calibration: Result with standard deviations; given values for parameters without evidence.
-        evidence: Per group of ``TESTED``, and ``SHUTTER``, the decrease of the cost of held-out pairs in standard
-            errors; NaN if there were too few pairs.
-        gain: Share by which the cost of held-out pairs decreased.
+        calibration: With standard deviations; given values without evidence.
+        evidence: Per group of ``TESTED``, and ``SHUTTER``: decrease of held-out costs, standard errors; NaN with too
+            few pairs.
+        gain: Share by which held-out costs decreased.
     """
 
     calibration: Calibration
@@ -69,13 +68,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Fits to both halves of the time with some free parameters, and their costs on the other halves.
-
-    Attributes:
-        free: (13,) bool.
-        fits: One per half.
-        costs: (2, P) each, of intensities and depths of the pairs of the other half.
-    """
+    """Fits to both halves of the time with some free parameters, and costs (2, P) on the other halves."""
 
     free: NDArray[np.bool_]
     fits: list[Fit]
@@ -87,19 +80,17 @@ class _Trial:
         return np.concatenate(other.costs, axis=1) - np.concatenate(self.costs, axis=1)
 
     def evidence(self, gains: NDArray[np.float64]) -> float:
-        """Mean of gains (P,) of all pairs in standard errors."""
         second, first = (pairs.numbers for pairs in self.halves)
         error = standard_error(gains, np.concatenate([first, second + 1 + first.max()]))
         return float(gains.sum() / max(error, 1e-12))
 
     def improvement(self, other: "_Trial") -> tuple[float, float]:
-        """Decrease of the cost relative to another trial: standard errors, and the smaller share of both halves."""
+        """Decrease of the cost: standard errors, and the smaller share of both halves."""
         shares = [1 - after.sum() / before.sum() for before, after in zip(other.costs, self.costs, strict=True)]
         return self.evidence(self.gains(other).sum(axis=0)), float(min(shares))
 
     def proves(self, other: "_Trial", group: str) -> bool:
-        """Whether this trial lets a group leave its given values: the improvement suffices and neither cost gets
-        significantly worse."""
+        """Whether a group leaves its given values: the improvement suffices and no cost gets significantly worse."""
         evidence, share = self.improvement(other)
         worse = min(self.evidence(gains) for gains in self.gains(other)) <= -EVIDENCE
         return evidence >= EVIDENCE and share >= MATERIAL[group] and not worse
@@ -116,23 +107,22 @@ def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
 
 
 class CalibrationEstimator:
-    """Calibration from pairs of frames of a static scene, by differences of intensity and depth.
+    """Calibration from pairs of frames of a static scene.
 
     With the projection pi(theta, xi, X) of ``Calibration`` at camera velocity xi, a point X of the depth image of frame
     i, and the relative pose T of the depth cameras, the residuals are
 
         r_I = I_j(pi(theta, xi_j, T X)) - g I_i(pi(theta, xi_i, X)) - o,      r_D = Z_j(T X) - (T X)_z.
 
-    An error of theta rotates with the camera and varies with its velocity. The calibration is common to all pairs, and
-    T follows from the unknown poses of both frames. Gain g and offset o belong to the pair (``Adjustment``). Robust
-    Gauss-Newton, coarse to fine, with priors at the given values. The covariance has three parts:
+    The calibration is common to all pairs; T follows from the unknown poses. Robust Gauss-Newton, coarse to fine, with
+    priors at the given values. The covariance has three parts:
 
-    * A sandwich with one score per frame, the sum over its pairs, whose errors are correlated (Aronow, Samii and
-      Assenova 2015, without the correction for pairs counted twice).
-    * A factor for differences between both halves of the time, for example by a bent depth image (Birge 1932).
-    * The difference between a fit of all parameters and the result: wrong given values bias the estimated ones.
+    * A sandwich with one score per frame, whose errors are correlated (Aronow, Samii and Assenova 2015, without the
+      correction for pairs counted twice).
+    * A factor for differences between both halves of the time (Birge 1932).
+    * The difference between a fit of all parameters and the result.
 
-    ``given`` is the initial calibration; 2 ``workers`` (threads) process both halves of the time in parallel.
+    ``given``: initial calibration; 2 ``workers`` (threads) process both halves.
     """
 
     def __init__(self, given: Calibration, sensor: SensorConfig, workers: int = 1) -> None:
@@ -144,8 +134,8 @@ class CalibrationEstimator:
     def estimate(self, keyframes: Sequence[ColorKeyframe]) -> Estimate:
         """Calibration from keyframes in order of time; parameters without evidence keep their given values.
 
-        Groups of parameters leave the given values one by one, most evidence first. Evidence is a better prediction of
-        one half's pairs by an estimate from the other half.
+        Groups leave the given values one by one, most evidence first: one half's estimate predicts the other half's
+        pairs better.
         """
         halves = _halves(keyframes, SHUTTER_PAIRS)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:
@@ -164,8 +154,7 @@ class CalibrationEstimator:
         )
 
     def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
-        """Depth readout (s; the given one unless another is proven), its standard deviation, evidence, and relative
-        decrease of the cost."""
+        """Depth readout (s), its standard deviation, evidence, and relative decrease of the cost."""
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -220,7 +209,7 @@ class CalibrationEstimator:
         return Estimate(found, evidence, gain, len(pairs))
 
     def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, float]:
-        """Vignetting (the given value unless another is proven), its standard deviation, and the evidence."""
+        """Vignetting, its standard deviation, and the evidence."""
         given = self.given.vignetting
         halves = [Brightness.of(pairs, fit) for pairs, fit in zip(proven.halves, proven.fits, strict=True)]
         found = [half.fitted()[0] for half in halves]
@@ -232,7 +221,7 @@ class CalibrationEstimator:
         return vignetting if is_proven else given, sigma, evidence
 
     def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
-        """Factor >= 1 for standard deviations: rms difference of both halves in standard deviations."""
+        """Factor >= 1 for standard deviations: rms difference of both halves."""
         everything, finest = np.ones(NUM_PARAMETERS, dtype=bool), self.adjustment.levels[-1:]
         with ThreadPoolExecutor(self.workers) as pool:
             solved = pool.map(lambda n: self.adjustment.solve(halves[n], starts[n], everything, finest), (0, 1))
@@ -264,10 +253,10 @@ class CalibrationEstimator:
     def _together(
         self, halves: list[PairSet], before: "_Trial", names: Sequence[str]
     ) -> tuple["_Trial", dict[str, float]]:
-        """Groups that explain the pairs only jointly, and the evidence of each given the others.
+        """Groups that explain the pairs only jointly, such as focal length and delay, and the evidence of each given
+        the others.
 
-        With a wrong focal length no delay improves the cost, and vice versa. All groups are freed, then fixed one by
-        one.
+        All groups are freed, then fixed one by one.
         """
         trial, names = self._trial(halves, before, names), list(names)
         while len(names) > 1 and all(trial.proves(before, name) for name in names):

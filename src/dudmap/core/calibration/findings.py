@@ -1,4 +1,4 @@
-"""Sentences on a calibration: one line on its outcome, and one finding per group of parameters."""
+"""Sentences on a calibration: its outcome, and one per group of parameters."""
 
 from dataclasses import replace
 
@@ -20,13 +20,13 @@ UNITS = {
     "vignetting": ("%", 100.0),
     "depth_readout": ("ms", 1000.0),
 }
-"""Display unit of each kind of parameter, and units per metre, radian, pixel or second."""
+"""Display unit of each kind of parameter, and units per SI unit."""
 ASSUMED = "assumed as given, not tested"
-"""Finding on a colour camera that was not compared with images."""
+"""Finding on an untested colour camera."""
 
 
 def kind_of(parameter: str) -> str:
-    """Kind of a parameter, a key of ``UNITS``; the axes of a translation are one kind."""
+    """Kind of a parameter, a key of ``UNITS``."""
     return parameter.rpartition("_")[0] if parameter[-2:] in ("_x", "_y", "_z") else parameter
 
 
@@ -78,7 +78,7 @@ def _sigma(calibration: Calibration, members: tuple[str, ...]) -> str:
 
 
 def outcome(found: Calibration, camera: Camera) -> str:
-    """One line on the colour camera of a depth ``camera``: where it is, and which groups were estimated."""
+    """One line on the colour camera of a depth ``camera``."""
     plain = replace(found, delay=0.0, readout=0.0, vignetting=0.0)
     place = "registered" if plain.is_registered(replace(camera, distortion=())) else "a camera of its own"
     first = {name: members[0] for name, members in TESTED.items()} | {SHUTTER: SHUTTER_PARAMETER}

@@ -25,16 +25,16 @@ SAME_SURFACE = 0.03
 
 
 BAND = 1.0, 4.0
-"""Standard deviations of the two Gaussians of the intensity filter (difference of Gaussians), pixels. Vignetting,
-shading and exposure stay with the camera like a displacement; single-pixel detail spoils derivatives."""
+"""Standard deviations of the difference of Gaussians that filters intensities, pixels: without shading and single-pixel
+detail."""
 BESIDE = 2
-"""Dilation of moving pixels, because their outline is uncertain, pixels."""
+"""Dilation of moving pixels, pixels."""
 INTERVAL = 0.1
 """Initial time between two keyframes, seconds."""
 MAX_KEYFRAMES = 60
-"""Largest number of keyframes; beyond it every second one is dropped."""
+"""Keyframes; beyond it every second one is dropped."""
 MAX_GAP = 0.45
-"""Largest time between the neighbours of a keyframe for a known velocity, seconds: two intervals at 5 Hz."""
+"""Largest time between the neighbours of a keyframe, seconds: two intervals at 5 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,13 +48,12 @@ class ColorKeyframe:
         depth: (h, w) float32, metres, 0 = moving or no measurement.
         points: (n, 3) float32 in the camera frame, away from depth edges.
         tangents: (n, 6) float32, two directions of the surface at each point.
-        intensities: (h, w) float32 of the recorded colour image, filtered with ``BAND``, coarse to fine; NaN at moving
-            pixels.
+        intensities: (h, w) float32 recorded, filtered with ``BAND``, coarse to fine; NaN at moving pixels.
         brightness: (h, w) float32, unfiltered intensities of the smallest size.
         T_world_camera: (4, 4).
         velocity: (6,) twist per second, camera axes.
-        depth_readout: Rolling-shutter readout for which the depth was rectified, seconds.
-        interval: Mean interval between the three frames that give the velocity, seconds.
+        depth_readout: Removed rolling-shutter readout, seconds.
+        interval: Mean interval of the three frames of the velocity, seconds.
     """
 
     timestamp: float
@@ -82,9 +81,9 @@ def color_levels(camera: Camera) -> list[int]:
 
 
 def levels_of(observation: Observation, given: Calibration) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
-    """Compared depth (h, w) of an observation, and its recorded intensities (h, w), coarse to fine.
+    """Depth (h, w) and recorded intensities (h, w), coarse to fine.
 
-    ``given`` is the calibration of the colour images.
+    ``given``: calibration of the colour images.
     """
     depth, _ = observation.halved(halvings_to(GEOMETRY_WIDTH, observation.camera))
     return depth, [recorded_intensity(observation, number) for number in color_levels(given.camera)]
@@ -98,7 +97,7 @@ def keyframe(
     dynamic_mask: NDArray[np.bool_],
     interval: float = MAX_GAP / 2,
 ) -> ColorKeyframe:
-    """Keyframe of a preprocessed frame, without the moving pixels of either image.
+    """Keyframe of a preprocessed frame, without moving pixels.
 
     ``T_world_camera``: (4, 4). ``velocity``: (6,) twist per second, camera axes. ``dynamic_mask``: (H, W). ``given``:
     calibration of the recorded colour images. ``interval``: see ``ColorKeyframe``.
@@ -132,7 +131,6 @@ def keyframe(
 def _seen_moving(
     moving: NDArray[np.bool_], distance: float, camera: Camera, color_camera: Camera, T_color_depth: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Pixels (h, w) of a colour image that show the ``moving`` depth pixels at ``distance`` metres, dilated."""
     import cv2
 
     plane = T_color_depth[:3, :3] + np.outer(T_color_depth[:3, 3], (0, 0, 1 / distance))
@@ -142,7 +140,6 @@ def _seen_moving(
 
 
 def _filtered(image: NDArray[np.float32], moving: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Intensities (h, w) filtered with ``BAND`` without the ``moving`` pixels, which become NaN."""
     import cv2
 
     still = (~moving).astype(np.float32)
@@ -174,8 +171,7 @@ def central_velocity(
 class KeyframeCollector(Stateful):
     """Collects keyframes in order of time, evenly since tracking began.
 
-    ``given`` is the calibration of the colour images. ``max_gap`` limits the time between the two neighbours of a
-    keyframe, seconds, below ``MAX_GAP``.
+    ``max_gap``: limit of the time between a keyframe's neighbours, seconds, below ``MAX_GAP``.
     """
 
     _taken: Remembered[list[Callable[[], ColorKeyframe]]]
@@ -192,14 +188,13 @@ class KeyframeCollector(Stateful):
 
     @property
     def keyframes(self) -> list[ColorKeyframe]:
-        """The keyframes so far; waits for keyframes that another thread computes."""
+        """The keyframes so far; waits for another thread."""
         return [taken() for taken in self._taken]
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
     ) -> None:
-        """Add a tracked frame with its pose (4, 4) and moving pixels (H, W). The previous one may become a keyframe,
-        as its velocity is now known."""
+        """Add a tracked frame with its pose (4, 4) and moving pixels (H, W). The previous one may become a keyframe."""
         now = observation.timestamp
         if observation.ignored is not None:
             dynamic_mask = dynamic_mask | observation.ignored
@@ -218,11 +213,11 @@ class KeyframeCollector(Stateful):
         self._pending = observation, T_world_camera, dynamic_mask
 
     def interrupt(self) -> None:
-        """Forget the neighbours after a lost frame or a jump of the pose, because the velocity across it is unknown."""
+        """Forget the neighbours after a lost frame or a jump of the pose."""
         self._before = self._pending = None
 
     def clear(self) -> None:
-        """Forget all keyframes when another map begins, because their poses are not comparable."""
+        """Forget all keyframes for another map."""
         self.interrupt()
         self._taken.clear()
         self._interval, self._latest = INTERVAL, -np.inf

@@ -24,7 +24,7 @@ from dudmap.core.tracking.frame_view import FrameView
 log = logging.getLogger(__name__)
 
 ATTEMPTS = (120, 240, 480, 960)
-"""Tracked frames after which the calibration is estimated: four seconds by hand show every error."""
+"""Tracked frames after which the calibration is estimated."""
 USED_AFTER = 60
 """Tracked frames between start and use of an estimate: two seconds at 30 Hz."""
 
@@ -32,8 +32,7 @@ USED_AFTER = 60
 class SelfCalibration(Stateful):
     """Estimates the calibration repeatedly during tracking, in another process.
 
-    Each estimate starts from the given calibration and uses all keyframes of the current submap with recorded colours.
-    It does not depend on the calibration at tracking time.
+    Each starts from the given calibration, independent of the present one, with all keyframes of the submap.
 
     Attributes:
         estimate: The last finished estimate; None before.
@@ -67,8 +66,7 @@ class SelfCalibration(Stateful):
         dynamic_mask: NDArray[np.bool_],
         submap: int,
     ) -> None:
-        """Add a tracked frame with its pose (4, 4) in the world of a submap and moving pixels (H, W); start an
-        estimation if due."""
+        """Add a tracked frame (pose (4, 4), moving pixels (H, W)); start an estimation if due."""
         self._frames += 1
         if not self._attempts:
             return
@@ -84,7 +82,7 @@ class SelfCalibration(Stateful):
                 self._collector.clear()
 
     def interrupt(self, *, moved: bool = False) -> None:
-        """Handle a lost frame, or (``moved``) a correction of past poses, which later poses do not fit."""
+        """Handle a lost frame, or (``moved``) a correction of past poses."""
         if moved:
             self._collector.clear()
         self._collector.interrupt()
@@ -106,8 +104,7 @@ class ColorCalibration(Stateful):
 
     Args:
         camera: Camera of the depth images, without lens distortion.
-        start: The initial calibration; None for colour registered to depth. An estimated one with known standard
-            deviations is kept.
+        start: Initial calibration; None for registered colour. An estimated one with standard deviations is kept.
         color_motion: Registers the colours of the frames.
     """
 
@@ -138,7 +135,7 @@ class ColorCalibration(Stateful):
 
     @property
     def waits(self) -> int:
-        """Number of frames that waited for a calibration."""
+        """Frames that waited for a calibration."""
         return 0 if self._estimation is None else self._estimation.waits
 
     @property
@@ -147,17 +144,16 @@ class ColorCalibration(Stateful):
         return self._next or self._color_motion.calibration or self._start
 
     def repaint(self) -> None:
-        """Repaint a map that was built again while it was repainted."""
+        """Repaint a map that was rebuilt during its repainting."""
         if self._next is not None:
             self._atlas.recolor()
 
     def update(
         self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
     ) -> bool:
-        """Learn from a tracked frame with its pose (4, 4) and dynamic pixels (H, W) bool; ``corrected``: it closed a
-        loop.
+        """Learn from a tracked frame (pose (4, 4), dynamic pixels (H, W) bool); ``corrected``: it closed a loop.
 
-        Returns whether the next frame is the first with a new calibration; the maps have been repainted with it.
+        Returns whether the next frame has a new calibration; the maps are then repainted.
         """
         if self._estimation is None or (self._estimation.finished and self._next is None):
             return False

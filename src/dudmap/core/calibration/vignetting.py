@@ -12,9 +12,8 @@ from dudmap.core.geometry.camera import Camera
 
 Values = NDArray[np.float64]
 EXPOSED = 0.06, 0.94
-"""Compared intensities: darker ones have an unknown black level, brighter ones are saturated."""
+"""Compared intensities: darker ones have an unknown black level, brighter are saturated."""
 SCALE = 0.02
-"""Scale of the robust weights: the noise of common colour cameras, 0.01, at half of the full brightness."""
 ITERATIONS = 8
 """Iterations after which the result changes by less than a thousandth."""
 
@@ -23,14 +22,14 @@ ITERATIONS = 8
 class Brightness:
     """Brightness of common surfaces in both frames of P pairs.
 
-    The log ratio of both brightnesses is the log ratio of the exposures minus the vignetting times the difference of
-    the squared distances to the image centre. On an untextured wall this holds even for wrong poses.
+    The log ratio is the log ratio of the exposures minus the vignetting times the difference of the squared distances
+    to the centre, on a wall even for wrong poses.
 
     Attributes:
         numbers: (P, 2) int64, the frames of every pair.
         pair: (n,) int64, the pair of every point.
         ratio: (n,) logarithm of the brightness in the second frame over the first.
-        outwards: (n,) squared distance to the centre in the second frame minus the first; 1 at the corners.
+        outwards: (n,) squared distance to the centre, second minus first; 1 at the corners.
     """
 
     numbers: NDArray[np.int64]
@@ -40,7 +39,7 @@ class Brightness:
 
     @classmethod
     def of(cls, pairs: PairSet, fit: Fit) -> "Brightness":
-        """Brightness of pairs of frames with the poses and the calibration of a fit."""
+        """Brightness of pairs with poses and calibration of a fit."""
         calibration = fit.calibration
         places = se3.inverse(fit.Ts_camera_world)
         camera = calibration.camera.resized(*pairs.brightness.shape[:0:-1])
@@ -95,10 +94,7 @@ def _moved(T: Values, points: Values) -> Values:
 
 
 def _seen(brightness: NDArray[np.float32], camera: Camera, points: Values) -> tuple[Values, Values]:
-    """Brightness at points (n, 3) in the frame of a colour camera, and their squared distance to the image centre.
-
-    Brightness is NaN outside the image; the distance is 1 at the corners.
-    """
+    """Brightness at points of a colour camera (NaN outside), and squared distance to the centre (1 at the corners)."""
     pixels = camera.project(points)
     middle = (np.array(camera.shape[::-1]) - 1) / 2
     return _sampled(brightness, pixels), np.sum((pixels - middle) ** 2, axis=1) / np.sum(middle**2)

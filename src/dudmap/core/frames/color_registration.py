@@ -1,4 +1,4 @@
-"""Registration of the colour image to the depth image of the same frame: depth viewpoint, depth time."""
+"""Registration of colour to the depth image of the same frame."""
 
 from functools import lru_cache
 from typing import TypeVar
@@ -24,8 +24,7 @@ BAND_ROWS = 60
 def color_projection(calibration: Calibration, twist: NDArray[np.float64], offset: float) -> ColorProjection:
     """Projection of points of the depth camera into the colour image.
 
-    The motion T exp(-tau xi) X is expanded to the second order in tau: with a = v + omega x X it is T X - tau R a +
-    tau^2 / 2 R (omega x a). At 3 rad/s and 30 ms the third order is below 0.1 pixels.
+    T exp(-tau xi) X in second order of tau: with a = v + omega x X it is T X - tau R a + tau^2 / 2 R (omega x a).
 
     Args:
         calibration: Colour camera relative to the depth camera.
@@ -63,7 +62,7 @@ def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.fl
 
 
 def typical_depth(depth: NDArray[np.float32]) -> float:
-    """Median of sampled depths of an image (H, W), metres; 1 for an image without depth."""
+    """Median of sampled depths (H, W), metres; 1 without depth."""
     readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
     readings = readings[readings > 0]
     return float(median(readings)) if len(readings) else 1.0
@@ -75,10 +74,10 @@ def register_color(
     camera: Camera,
     projection: ColorProjection,
 ) -> NDArray[Pixel]:
-    """Colour (H, W[, 3]) of each depth pixel, interpolated; the nearest colour pixel outside the colour image.
+    """Colour (H, W[, 3]) of each depth pixel, interpolated, clamped to the colour image.
 
-    ``color`` (h, w[, 3]) is the recorded image, ``depth`` (H, W) has no lens distortion, metres, 0 = none. Occlusion is
-    not resolved.
+    ``color``: (h, w[, 3]) recorded; ``depth``: (H, W) without lens distortion, metres, 0 = none. Occlusion is not
+    resolved.
     """
     import cv2
 

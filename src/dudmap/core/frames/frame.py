@@ -22,20 +22,19 @@ NO_COLOR = (
     "needs no colour"
 )
 GREY = 192
-"""Grey value of all pixels of a frame without colour: light, so that shading is visible."""
+"""Grey value of frames without colour: light, so that shading is visible."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Depth and colour image of about one instant. The constructor copies nothing; ``Slam`` copies the arrays that it
-    keeps.
+    """Depth and colour image of about one instant. The constructor copies nothing; ``Slam`` does.
 
     Attributes:
         timestamp: Seconds, of the depth image.
         depth: (H, W) float32, metres along the optical axis, 0 = no measurement.
-        color: (H, W, 3) uint8, red green blue; a separate colour camera may have another size. None for depth without
-            colour, which is registered by distances alone.
-        color_timestamp: Seconds, of the colour image; None if unknown. Used with a calibration of the colour camera.
+        color: (H, W, 3) uint8, red green blue; a separate camera may have another size. None: registered by distances
+            alone.
+        color_timestamp: Seconds; None if unknown. Used with a colour calibration.
     """
 
     timestamp: float
@@ -48,12 +47,12 @@ class Frame:
         return f"Frame({self.timestamp:.6f} s, depth {self.depth.shape}, {color})"
 
     def copy(self) -> "Frame":
-        """Copy of the frame and its images, so that the caller may change the originals."""
+        """Copy with copied images."""
         return replace(self, depth=np.array(self.depth), color=None if self.color is None else np.array(self.color))
 
     @property
     def rgb(self) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) uint8; ``GREY`` in the size of ``depth`` for a frame without colour."""
+        """Colours (H, W, 3) uint8; ``GREY`` in the size of ``depth`` without colour."""
         return np.full((*self.depth.shape, 3), GREY, np.uint8) if self.color is None else self.color
 
     @classmethod
@@ -67,11 +66,11 @@ class Frame:
         """Frame of copies of two images.
 
         Args:
-            depth: (H, W), along the optical axis, registered to colour. Floating point is metres; 0 and non-finite
-                values mean no measurement. uint16 is in units of ``depth_scale``; 0 means no measurement.
-            rgb: (H, W, 3) uint8, red green blue; None for depth without colour.
+            depth: (H, W) along the optical axis, registered to colour. Floating point: metres, 0 and non-finite = none.
+                uint16: ``depth_scale``, 0 = none.
+            rgb: (H, W, 3) uint8, red green blue; None for none.
             timestamp: Seconds.
-            depth_scale: Units of uint16 depth per metre; 1000 = millimetres. Not used for floating point.
+            depth_scale: uint16 units per metre; 1000 = millimetres.
 
         Raises:
             FrameError: An argument is not an array or has the wrong shape or type, or the time is not finite.

@@ -1,4 +1,4 @@
-"""Pixels that never count because they show parts fixed to the camera: a robot arm, a bonnet, a vignette."""
+"""Ignored pixels, which show parts fixed to the camera: a robot arm, a bonnet, a vignette."""
 
 from dataclasses import dataclass
 
@@ -10,8 +10,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 
 DISTANCES = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
-"""Distances at which pixels are projected into the other image, metres: each doubling halves the shift by the
-baseline."""
+"""Distances of projection into the other image, metres: each doubling halves the shift."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +20,7 @@ class IgnoredRegion:
     Attributes:
         depth: (H, W) bool, of the depth image.
         color: (h, w) bool, of the colour image.
-        nearest: (n,) int, index of the nearest unmasked pixel for each ignored pixel of the colour image.
+        nearest: (n,) int, nearest unmasked pixel of each ignored colour pixel.
     """
 
     depth: NDArray[np.bool_]
@@ -30,8 +29,7 @@ class IgnoredRegion:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_], camera: Camera, calibration: Calibration | None) -> "IgnoredRegion":
-        """Region of a mask of the size of the depth or colour image, projected into the other image at all
-        ``DISTANCES``.
+        """Region of a mask of the depth or colour image, projected into the other at all ``DISTANCES``.
 
         Raises:
             ConfigError: The mask has the size of neither image or the wrong type, or covers a whole image.
@@ -58,7 +56,7 @@ class IgnoredRegion:
         return cls(depth.copy(), color, _nearest(color))
 
     def filled(self, color: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Colour image (h, w, 3) with ignored pixels filled from their border, without features or edges."""
+        """Colour image (h, w, 3) with ignored pixels filled from their border."""
         out = color.copy()
         out[self.color] = color.reshape(-1, 3)[self.nearest]
         return out
@@ -77,7 +75,6 @@ def _nearest(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _places(camera: Camera, calibration: Calibration, distance: float) -> NDArray[np.int64]:
-    """Pixels (H, W, 2), u and v, of the colour image to which depth pixels project at a distance (m)."""
     import cv2
 
     points = camera.backproject(np.full(camera.shape, distance, np.float32)).reshape(-1, 3).astype(np.float64)

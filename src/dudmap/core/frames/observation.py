@@ -1,4 +1,4 @@
-"""A preprocessed frame, its image pyramid and corners, and exposure compensation to the intensities of the map."""
+"""A preprocessed frame, its image pyramid, corners and exposure."""
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,16 +14,15 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.state import CACHE
 
 CEILING_STRIDE, LEAST_SATURATED = 8, 0.05
-"""Stride in rows and columns of the saturation limit, and quantile of the intensities of saturated pixels."""
+"""Stride of the saturation limit, and quantile of saturated intensities."""
 HALVING_BAND = 0.02
-"""Largest distance between measurements of one surface in a 2x2 block, share of the depth, at least of the reference
-depth."""
+"""Largest depth difference of one surface in a 2x2 block, share of the depth, at least of the reference depth."""
 CELLS = 40
 """Cells across the image; the strongest corner of each cell is used."""
 WINDOW = 11
 """Edge of the window for matching a corner, pixels of an image 320 wide."""
 FLOW_WIDTH = 320
-"""Image width to which windows and flow refer; they grow in proportion."""
+"""Image width to which windows and flow refer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,15 +34,15 @@ class Observation:
         camera: Camera of all images here; without lens distortion.
         depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
         intensity: (H, W) float32, 0..1.
-        rgb: (H, W, 3) uint8, registered to the depth; ``intensity`` likewise. Images of an asynchronous colour camera
-            are registered once the camera's motion is known (``core/tracking/color_motion.py``).
-        recorded_rgb: (h, w, 3) uint8 of a separate colour camera, not registered; None if equal to ``rgb``.
-        color_offset: Time stamp of the colour image minus time stamp of the depth image, seconds; 0 if unknown.
-        depth_readout: Rolling-shutter readout that was removed from the depth, seconds.
-        has_color: Whether the frame has a colour image; otherwise ``rgb`` and ``intensity`` are uniform grey.
-        ignored: (H, W) bool, pixels that never count and have no depth; None for none.
+        rgb: (H, W, 3) uint8, registered, like ``intensity``. Asynchronous colour is registered once the camera's motion
+            is known (``core/tracking/color_motion.py``).
+        recorded_rgb: (h, w, 3) uint8, not registered; None if equal to ``rgb``.
+        color_offset: Time stamp of colour minus depth, seconds; 0 if unknown.
+        depth_readout: Removed rolling-shutter readout, seconds.
+        has_color: Whether there is colour; else ``rgb`` and ``intensity`` are grey.
+        ignored: (H, W) bool, pixels that never count; None for none.
         reference_depth: Reference depth of the sensor, metres.
-        sources: (H, W) int32, index of the recorded pixel that each pixel shows; None if unchanged.
+        sources: (H, W) int32, recorded pixel of each pixel; None if unchanged.
     """
 
     timestamp: float
@@ -75,7 +74,7 @@ class Observation:
 
     @cached_property
     def ceiling(self) -> float:
-        """Smallest intensity with a saturated colour channel, 1 if there is none."""
+        """Smallest intensity with a saturated channel, else 1."""
         full = (self.rgb[::CEILING_STRIDE, ::CEILING_STRIDE] == 255).any(axis=2)
         if not full.any():
             return 1.0
@@ -84,8 +83,7 @@ class Observation:
     def halved(self, times: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and intensity (H >> times, W >> times) of ``camera.scaled(times)``, halved by 2x2 blocks.
 
-        Intensity is the mean of a block; depth is the mean of its measurements on the nearest surface. Each halving is
-        cached.
+        Intensity is the mean of a block; depth the mean on its nearest surface. Cached.
         """
         halvings = self._halvings
         while len(halvings) < times:
@@ -95,7 +93,7 @@ class Observation:
 
     @property
     def as_recorded(self) -> Frame:
-        """Depth of the observation and the recorded colour."""
+        """Depth and recorded colour."""
         color = self.rgb if self.recorded_rgb is None else self.recorded_rgb
         color = color if self.has_color else None
         return Frame(self.timestamp, self.depth, color, self.timestamp + self.color_offset)
@@ -108,7 +106,7 @@ class Level:
     Attributes:
         depth, intensity: (h, w) m; (h, w) 0..1.
         ceiling: Smallest intensity that is saturated.
-        shown: Range of intensities in which neither the image nor the map is saturated.
+        shown: Intensities saturated neither in the image nor in the map.
     """
 
     camera: Camera
@@ -129,10 +127,7 @@ class Level:
 
     @cached_property
     def foreground(self) -> NDArray[np.bool_]:
-        """Pixels (h, w) on the nearest surface in their corner window.
-
-        A window across a depth edge follows the foreground, not the background.
-        """
+        """Pixels (h, w) on the nearest surface in their corner window, which a window follows."""
         import cv2
 
         side = scaled_window(WINDOW, self.camera.width)
@@ -142,7 +137,7 @@ class Level:
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) with gain and offset applied, comparable to the map; black if only the image is saturated."""
+    """Colours (H, W, 3) with gain and offset; black if only the image is saturated."""
     import cv2
 
     gain, offset = exposure
@@ -154,10 +149,10 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
 
 
 def shown_range(exposure: tuple[float, float], ceiling: float, other: float = 1.0) -> tuple[float, float]:
-    """Range of map intensities saturated neither in the map nor in an image with this gain and offset.
+    """Map intensities saturated neither in the map (limit ``other``) nor in an image with this gain and offset
+    (``ceiling``).
 
-    The saturation limit of the image is ``ceiling``, of the map ``other``. The range is infinite if the exposures
-    hardly differ.
+    Infinite if the exposures hardly differ.
     """
     gain, offset = exposure
     if 1 / LARGE_GAIN < gain < LARGE_GAIN:
@@ -170,7 +165,7 @@ def saturated(
 ) -> NDArray[np.bool_] | None:
     """Saturated pixels (h, w) bool of the image; None if the exposures hardly differ.
 
-    With ``difference`` (map minus image), pixels saturated in the map are included.
+    ``difference`` (map minus image): includes pixels saturated in the map.
     """
     darkest, brightest = shown_range(exposure, level.ceiling)
     if brightest == np.inf:
@@ -183,7 +178,7 @@ def saturated(
 
 
 def unsaturated(level: Level, exposure: tuple[float, float]) -> Level:
-    """Level with gain and offset applied to its intensities; NaN if only the image is saturated."""
+    """Level with gain and offset; NaN if only the image is saturated."""
     lit, dark = exposed(level, exposure), saturated(level, exposure)
     return lit if dark is None else replace(lit, intensity=np.where(dark, np.float32(np.nan), lit.intensity))
 
@@ -204,10 +199,7 @@ def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[floa
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Image pyramid of an observation: levels of the registration, coarse to fine, and level of the dynamic labels.
-
-    Each is the image halved several times.
-    """
+    """Image pyramid: levels of the registration, coarse to fine, and of the labels; each is halved several times."""
 
     tracked: list[Level]
     labelled: Level
@@ -246,7 +238,7 @@ class Pyramid:
 
 
 def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
-    """Mask (H, W) at the size of a level; a pixel is set if any part of it lies in the mask."""
+    """Mask (H, W) at the size of a level; set if any part is."""
     import cv2
 
     size = level.depth.shape[::-1]
@@ -254,18 +246,17 @@ def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
 
 def is_majority_dynamic(moving: NDArray[np.bool_], level: Level) -> bool:
-    """Whether more than half of the depth pixels of a level are marked as moving (h, w) bool."""
+    """Whether more than half of the depth pixels are marked (h, w) bool."""
     return bool(2 * np.count_nonzero(moving) > level.num_readings)
 
 
 def scaled_window(edge: int, width: int, reference_width: int = FLOW_WIDTH) -> int:
-    """Odd window edge in an image of some width that covers the same view as ``edge`` at ``reference_width``."""
+    """Odd window edge that covers the same view as ``edge`` at ``reference_width``."""
     return 2 * round((edge - 1) / 2 * width / reference_width) + 1
 
 
 def _corners(level: Level) -> NDArray[np.int64]:
-    """Strongest corners (n, 2) int, pixels u, v, one per cell, on the foreground of their window (Shi and Tomasi
-    1994)."""
+    """Strongest corner per cell, pixels u, v, on the foreground of its window (Shi and Tomasi 1994)."""
     import cv2
 
     image = level.grey

@@ -11,11 +11,11 @@ from dudmap.core.frames.observation import WINDOW, Pyramid, exposed, scaled_wind
 
 Number = TypeVar("Number", np.float32, np.float64)
 SIMILAR = 1.5
-"""A match is as good as another if the mean grey difference of its windows is at most this multiple of the other's."""
+"""Largest ratio of mean grey differences of equally good matches."""
 RETURN_PX = 0.5
 """Largest forward-backward error of a corner, pixels of an image 320 wide."""
 FEWEST = 128
-"""Smallest number of pixels for which another thread pays off."""
+"""Pixels for which another thread pays off."""
 
 
 def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
@@ -25,8 +25,8 @@ def lengths(vectors: NDArray[Number]) -> NDArray[Number]:
 
 
 def equally_exposed(before: Pyramid, after: Pyramid) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Grey values (h, w) of two images for matching corners. After a change of the light the darker image gets the
-    other exposure, and both are clipped to their common range."""
+    """Grey values (h, w) of two images for matching; after a change of light both have one exposure and the common
+    range."""
     pair = [before, after]
     dark, bright = sorted(pair, key=lambda pyramid: float(pyramid.coarse.intensity.mean()))
     darker, brighter = dark.coarse.intensity, bright.coarse.intensity
@@ -53,13 +53,12 @@ def lucas_kanade(
     Args:
         first, second: (h, w) uint8 images.
         pixels: (n, 2), u, v in the first image.
-        guess: (n, 2) positions in the second image at which the search starts.
+        guess: (n, 2) initial positions in the second image.
         window: Edge of the window, pixels.
-        halvings: Number of halvings up to the coarsest pyramid level.
+        halvings: Halvings to the coarsest level.
 
     Returns:
-        Positions (n, 2) in the second image, arbitrary if not found; whether each was found (n,); mean absolute grey
-        difference (n,) of the two windows.
+        Positions (n, 2), arbitrary if not found; found (n,); mean absolute grey difference (n,) of the windows.
     """
     import cv2
 
@@ -91,13 +90,12 @@ def track_forward_backward(
     Args:
         first, second: (h, w) uint8 images.
         pixels: (n, 2) int, u, v in the first image.
-        expected: (n, 2) predicted positions in the second image, at which the search starts.
-        window, halvings: As for ``lucas_kanade``, for the forward search.
-        limit: Forward-backward error at which a pixel fails, pixels.
+        expected: (n, 2) initial positions in the second image.
+        window, halvings: See ``lucas_kanade``.
+        limit: Forward-backward error, pixels.
 
     Returns:
-        Positions (n, 2) in the second image and mean grey differences (n,) of the windows, arbitrary for failed pixels;
-        whether each pixel passes (n,).
+        Positions (n, 2) and mean grey differences (n,), arbitrary for failed pixels; whether each passes (n,).
     """
     n = len(pixels)
 
@@ -120,17 +118,15 @@ def consistent_with_static(
     allowed: NDArray[np.float64],
     difference: NDArray[np.floating],
 ) -> NDArray[np.bool_]:
-    """Whether corners (n,) found elsewhere match as well at the position of a static point.
-
-    The coarse levels of the search may follow a nearer surface, and textures may repeat. The search is repeated from
-    the static position at full resolution alone.
+    """Whether corners (n,) found elsewhere match as well at the static position, because coarse levels may follow a
+    nearer surface.
 
     Args:
         first, second: (h, w) uint8 images.
         pixels: (n, 2) corners in the first image.
         expected: (n, 2) positions of static points in the second image.
-        allowed: (n,) largest distances of a match from these positions, pixels.
-        difference: (n,) grey differences of the matches found elsewhere, see ``lucas_kanade``.
+        allowed: (n,) largest distances of a match, pixels.
+        difference: (n,) grey differences of the found matches.
     """
     guess = expected.astype(np.float32)
     positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)

@@ -17,32 +17,28 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import FrameError
 
 HOLE_NOISE = 0.01
-"""Largest depth difference around a small hole that is always allowed, reference depths."""
+"""Depth difference around a small hole that is always allowed, reference depths."""
 STEEPEST = 9.5
 """Tangent of the largest angle of incidence that sensors measure, 84 degrees."""
 FILTER_ALPHA = 0.012
 """Range standard deviation of the bilateral filter, sigma_c = FILTER_ALPHA z^2, reference depths (thesis section 4.3:
 alpha = 12, in millimetres at 1 m)."""
 BORDER = 0.02
-"""Share of its width by which the colour image is extended; pixels beyond have no colour."""
+"""Share of the width by which the colour image is extended."""
 TYPICAL_DEPTH = 2.0
-"""Distance for the test which pixels the colour camera sees, reference depths."""
+"""Distance for the colour camera's field of view, reference depths."""
 DEPTH_MIN = 1e-3
-"""Smallest lower depth limit, metres; 0 means no measurement."""
+"""Smallest lower depth limit, metres."""
 
 
 class Preprocessor:
     """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing.
 
-    The bilateral filter is separable (columns, then rows), in a sixth of the time of the exact one
-    (``docs/design-notes.md``).
+    The separable bilateral filter takes a sixth of the exact one's time (``docs/design-notes.md``).
 
     Args:
-        calibration: Separate colour camera. Colour taken at another time than the depth is only scaled to its size, not
-            registered. Pixels that the colour camera does not see are dropped, because the registration uses both
-            images.
-        ignore: (H, W) bool, pixels that never count, see ``IgnoredRegion``. They get no depth, and the colours at their
-            border.
+        calibration: Separate colour camera. Asynchronous colour is only scaled. Pixels outside its view are dropped.
+        ignore: (H, W) bool, see ``IgnoredRegion``; no depth, colours of their border.
         sensor: Reference depth of the depth camera.
     """
 
@@ -110,7 +106,6 @@ class Preprocessor:
     def _colors(
         self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
     ) -> NDArray[np.uint8]:
-        """Colours (H, W, 3) registered to the depth, without the camera's motion."""
         if calibration.is_instant(offset):
             projection = color_projection(calibration, np.zeros(6), offset)
             return register_color(recorded, depth, self.camera, projection)
@@ -124,7 +119,7 @@ class Preprocessor:
         """Undistorted copy of a mask (H, W) bool of a frame.
 
         Raises:
-            FrameError: The mask does not have the camera's size, or is not boolean.
+            FrameError: Wrong size, or not boolean.
         """
         if not isinstance(mask, np.ndarray) or mask.shape != self.camera.shape or mask.dtype != np.bool_:
             h, w = self.camera.shape
@@ -138,10 +133,7 @@ class Preprocessor:
         return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0
 
     def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask (H, W) bool of an observation in the geometry of the recorded image: the inverse of ``mask``.
-
-        Ignored pixels, and pixels outside the observation, are False.
-        """
+        """Inverse of ``mask``; False at ignored pixels and outside the observation."""
         if self._ignored is not None and self._ignored_depth is not None:
             mask = mask & ~self._ignored_depth
         if self._inverse_map is None:
@@ -177,8 +169,8 @@ class Preprocessor:
     def _undistorted(
         self, depth: NDArray[np.float32], rgb: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel. A separate
-        colour camera is unchanged."""
+        """Images without lens distortion (eq. 3.88): colour interpolated, depth nearest. A separate colour camera is
+        unchanged."""
         import cv2
 
         assert self._maps is not None
@@ -191,7 +183,7 @@ class Preprocessor:
 
 
 def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray[np.bool_] | None:
-    """Pixels (H, W) that the colour camera does not see at a ``typical`` depth (m), or None."""
+    """Pixels outside the colour camera's view at a ``typical`` depth (m), or None."""
     import cv2
 
     points = camera.backproject(np.full(camera.shape, typical, np.float32)).reshape(-1, 3).astype(np.float64)
@@ -203,8 +195,7 @@ def _unseen(camera: Camera, calibration: Calibration, typical: float) -> NDArray
 
 
 def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
-    """Maps of cv2.remap from undistorted to distorted: nearest pixel, and interpolated, which rounds down half a
-    pixel off without its fractions."""
+    """Maps of cv2.remap from undistorted to distorted: nearest, and interpolated."""
     import cv2
 
     coefficients = np.array(camera.distortion, dtype=np.float64)
@@ -216,7 +207,7 @@ def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArra
 
 
 def _distortion(camera: Camera) -> tuple[NDArray, NDArray]:
-    """Map of cv2.remap from the distorted image into the undistorted one, nearest pixel."""
+    """Nearest-pixel map of cv2.remap from distorted to undistorted."""
     import cv2
 
     v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)

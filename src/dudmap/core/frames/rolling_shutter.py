@@ -22,7 +22,7 @@ def rectified_images(
     velocity: NDArray[np.float64],
     color: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
-    """Depth (H, W) and colour (H, W, 3; empty without one) at the time of the middle row, and the indices (H, W) of the
+    """Depth (H, W) and colour (H, W, 3; empty without) at the time of the middle row, and indices (H, W) of the
     recorded pixels.
 
     A point that the camera sees at X in the middle of the readout is recorded in row v at exp(-tau xi) X with tau =
@@ -32,7 +32,7 @@ def rectified_images(
         depth: (H, W), metres, 0 = none.
         camera: Camera of both images, without distortion.
         readout: Time from the first to the last row, seconds.
-        velocity: (6,) twist xi of the camera per second, its own axes.
+        velocity: (6,) twist xi per second, camera axes.
         color: (H, W, 3), with the row times of the depth.
     """
     projection = color_projection(Calibration(camera, depth_readout=readout), velocity, 0.0)
@@ -56,9 +56,8 @@ def rectified(
 
     Args:
         readout: Readout of the depth image, seconds.
-        velocity: (6,) twist of the camera per second, its own axes.
-        with_color: Whether colour has the row times of the depth and is rectified with it. Otherwise colour stays as
-            recorded and is registered afterwards.
+        velocity: (6,) twist per second, camera axes.
+        with_color: Whether colour has the row times of the depth; else it is registered later.
     """
     color = observation.rgb if with_color else None
     depth, rgb, sources = rectified_images(observation.depth, observation.camera, readout, velocity, color)

@@ -14,38 +14,36 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.verdict import ACCEPTED, Outcome, Verdict
 
 INTERVALS = 30
-"""Number of recent intervals between stamps; their median is the usual interval."""
+"""Recent intervals between stamps; their median is the usual one."""
 BURST_SHARE = 0.1
-"""Share of the usual interval below which frames were delayed and arrived at once; late frames of real sensors leave
-more than a third."""
+"""Share of the usual interval below which frames were delayed; real sensors leave more than a third."""
 FURTHEST_STEP = 60.0
 """Largest step of the stamps that is accepted at once, seconds."""
 AGREEING = 5
-"""Consecutive frames with consistent stamps after which the clock counts as reset."""
+"""Consecutive consistent frames that reset the clock."""
 STRIDE = 4
-"""Stride in rows and columns of the pixels compared for a change of the unit."""
+"""Stride of pixels compared for a change of the unit."""
 MIN_PIXELS = 100
-"""Smallest number of pixels with depth in both images for a comparison."""
+"""Fewest pixels with depth in both images."""
 SMALLEST_FACTOR = 1.5
-"""Smallest change of the unit: units differ by more (0.2 mm, 1/4 mm, 1 mm, 1 m)."""
+"""Smallest change of the unit (0.2 mm, 1/4 mm, 1 mm, 1 m)."""
 SAME_FACTOR, AGREEING_SHARE = 0.1, 0.8
-"""Relative tolerance of one factor of the depth, and share of pixels, of a change of the unit."""
+"""Tolerance of a factor of the depth, and share of pixels, for a change of the unit."""
 LONGEST_MEMORY = 1.0
 """Longest time between two compared depth images, seconds."""
 
 Images = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 """Depth (H, W) and colour (h, w, 3) of a frame; None without colour."""
 Repeats = Literal["", "frame", "depth", "color"]
-"""The part of a frame that equals the previous frame bit for bit."""
+"""The part equal to the previous frame bit for bit."""
 
 
 class StreamCheck(Stateful):
-    """Checks the stamp and the images of every frame against the previous frames, before registration.
+    """Checks the stamp and the images of every frame before registration.
 
-    Stamps must increase. The clock counts as reset if ``AGREEING`` consecutive frames increase among themselves but not
-    after the last used one. Their stamps are then shifted to follow it by the usual interval. An image that equals the
-    previous one bit for bit is a repetition. A change of the depth unit multiplies all depths by one factor between two
-    images; frames are rejected until it is reversed.
+    The clock is reset if ``AGREEING`` consecutive frames increase only among themselves; they are shifted to follow. An
+    image equal to the previous one is a repetition. A change of the depth unit multiplies all depths by one factor;
+    frames are rejected until it is reversed.
 
     Attributes:
         max_speed: Largest speed of the camera, m/s.
@@ -75,10 +73,10 @@ class StreamCheck(Stateful):
         return replace(observation, timestamp=observation.timestamp + self.clock_offset)
 
     def judge(self, observation: Observation) -> Verdict:
-        """Whether a frame can be used. Each frame must be checked once, in order of arrival.
+        """Whether a frame can be used; each is checked once, in order of arrival.
 
-        The checks are ``clock``, ``duplicate``, ``order``, ``burst`` and ``unit``. A frame that proves a clock reset is
-        accepted and changes ``clock_offset``; the caller then calls ``restamped``.
+        The checks are ``clock``, ``duplicate``, ``order``, ``burst`` and ``unit``. A frame that proves a clock reset
+        changes ``clock_offset``; the caller then calls ``restamped``.
         """
         before, self._before = self._before, (observation.depth, observation.as_recorded.color)
         self.repeats = "" if before is None else repeated(before, self._before)
@@ -111,7 +109,7 @@ class StreamCheck(Stateful):
         return ACCEPTED
 
     def _stamp_outcomes(self, stamp: float) -> Iterator[Outcome]:
-        """Whether a stamp can follow the last used one, seconds."""
+        """Whether a stamp can follow the last used one."""
         if self._last_stamp is None:
             return
         step, usual = stamp - self._last_stamp, self._usual_interval
@@ -150,7 +148,7 @@ class StreamCheck(Stateful):
 def repeated(before: Images, after: Images) -> Repeats:
     """The part of a frame that repeats the previous frame.
 
-    Empty depth images do not repeat. Repeated depth without colour is a repeated ``frame``.
+    Repeated depth without colour is a repeated ``frame``.
     """
     depth = _equal(before[0], after[0]) and bool(after[0].any())
     if before[1] is None or after[1] is None:
@@ -160,7 +158,7 @@ def repeated(before: Images, after: Images) -> Repeats:
 
 
 def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach: float) -> float:
-    """Factor by which all depths have changed, 1 if camera or scene motion may explain the change.
+    """Factor of all depths, 1 if motion may explain the change.
 
     Args:
         before, after: (h, w) metres, 0 = none.

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 SUCCESS = 0.9999
-"""Probability with which at least one RANSAC sample consists of inliers."""
+"""Probability of a RANSAC sample of inliers."""
 MIN_SIDE = 0.1
-"""Shortest side of a sample, metres; shorter sides define the rotation poorly."""
+"""Shortest side of a sample, metres, for a defined rotation."""
 REFINEMENTS = 3
-"""Number of least-squares fits to the inliers; the inliers are selected again after each."""
+"""Least-squares fits to reselected inliers."""
 
 
 def rigid_ransac(
@@ -19,18 +19,17 @@ def rigid_ransac(
     tolerance: NDArray[np.float64],
     inlier_share: float = 0.25,
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Rigid motion T_a_b with the most inliers among pairs of points (RANSAC); deterministic.
+    """Rigid motion T_a_b with the most inliers (RANSAC); deterministic.
 
-    RANSAC draws ``log(1 - p) / log(1 - w^3)`` samples of three pairs for a success probability p = ``SUCCESS``.
+    Draws ``log(1 - p) / log(1 - w^3)`` samples of three pairs, p = ``SUCCESS``.
 
     Args:
         a, b: (m, 3) the same points in two frames, metres.
-        tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of an inlier, metres.
-        inlier_share: Smallest inlier share w at which the motion is found, at least 0.1.
+        tolerance: (m,) largest distance of an inlier, metres.
+        inlier_share: Smallest inlier share w, at least 0.1.
 
     Returns:
-        T_a_b (4, 4), the least-squares fit to all inliers, and the inliers (m,) bool. The identity and no inliers if no
-        motion was found.
+        T_a_b (4, 4), fitted to all inliers, and the inliers (m,) bool; the identity and none if not found.
     """
     no_motion = np.eye(4), np.zeros(len(a), dtype=bool)
     if len(a) < 3:
@@ -63,9 +62,9 @@ def umeyama(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.
     """Least-squares rigid alignment of points ``b`` to ``a``, both (..., n, 3) (Umeyama 1991, eq. 34-42).
 
     Returns:
-        T_a_b (..., 4, 4), metres, and the joint extent (..., 3) of both sets along the principal directions, metres.
-        The extents are the square roots of the singular values of the cross-covariance. The rotation is determined only
-        if the second extent is not zero.
+        T_a_b (..., 4, 4), metres, and the joint extent (..., 3) of both sets, metres: square roots of the singular
+        values of the cross-covariance.
+        The rotation is determined if the second extent is not zero.
     """
     a_mean, b_mean = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
     U, singular, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))

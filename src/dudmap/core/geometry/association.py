@@ -14,7 +14,7 @@ from dudmap.errors import DatasetError
 from dudmap.input_files import read_text
 
 LARGEST_GAP = 0.02
-"""Largest time difference of an associated pair, seconds (default of the TUM benchmark's script)."""
+"""Largest time difference of a pair, seconds (TUM benchmark)."""
 
 
 class TimedFile(NamedTuple):
@@ -26,7 +26,7 @@ class TimedFile(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Path of the file, built on access because a list may have a million lines."""
+        """Path, built on access."""
         return Path(self.place)
 
 
@@ -41,7 +41,7 @@ def read_rows(path: Path, columns: str, *, short: bool = False) -> list[tuple[in
 
     Args:
         columns: Names of the fields, separated by blanks, e.g. ``timestamp file``.
-        short: Whether lines with fewer fields are returned, too.
+        short: Whether to return shorter lines.
 
     Raises:
         DatasetError: The file cannot be read, or a line does not have these columns.
@@ -91,7 +91,7 @@ def read_list(path: Path) -> list[TimedFile]:
 def read_pairs(path: Path) -> list[tuple[TimedFile, TimedFile]]:
     """(colour, depth) files of an associations list ``t_rgb rgb_file t_depth depth_file``.
 
-    Some tools write depth first; the folder names decide. Times are in any unit of ``time_unit``.
+    Folder names decide the order. Times are in any unit of ``time_unit``.
 
     Raises:
         DatasetError: The list is unreadable, or its depth times are not finite and strictly increasing.
@@ -112,7 +112,7 @@ def read_pairs(path: Path) -> list[tuple[TimedFile, TimedFile]]:
 
 
 def _second_stamp(path: Path, number: int, line: str, fields: list[re.Match[str]]) -> int:
-    """Index of the second time in a row of two times and two names, which may contain blanks."""
+    """Index of the second time in a row of two times and two names."""
     if len(fields) == 4:
         return 2
     places = [place for place in range(2, len(fields) - 1) if re.fullmatch(r"[-+.\deE]+", fields[place].group())]
@@ -157,7 +157,7 @@ def check_increasing(path: Path, numbers: list[int], stamps: list[float]) -> Non
     """Check that times increase from line to line.
 
     Raises:
-        DatasetError: They do not; the message names the first offending line.
+        DatasetError: It names the first offending line.
     """
     wrong = np.flatnonzero(np.diff(stamps) <= 0)
     if len(wrong):
@@ -174,7 +174,7 @@ def associate(
 ) -> list[tuple[int, int]]:
     """One-to-one pairs of nearest times, selected greedily by increasing time difference.
 
-    Returns indices into the increasing times (N,) and (M,), seconds, in the order of ``second``.
+    Indices into the increasing times (N,) and (M,), seconds, in the order of ``second``.
     """
     candidates = []
     starts = np.searchsorted(first, second - largest_gap, side="left")

@@ -31,30 +31,26 @@ MAX_VIGNETTING = 2.0
 class Calibration:
     """Pose, lens and timing of the colour camera relative to the depth image of the same frame.
 
-    The colour camera sees a point X of the depth camera, at the time of the depth image, at ``T_color_depth exp(-tau
-    xi) X``. xi is the twist of the depth camera's motion (its own axes, per second). tau, in seconds, is the difference
-    of the two time stamps + ``delay`` + (``depth_readout`` + ``readout``) (row / height - 1/2).
+    The point X of the depth camera, at the time of the depth image, is seen at ``T_color_depth exp(-tau xi) X``. xi is
+    the depth camera's twist per second, its own axes; tau (s) is the difference of the time stamps + ``delay`` +
+    (``depth_readout`` + ``readout``) (row / height - 1/2).
 
-    Depth images have a rolling shutter as well: a row is taken ``depth_readout`` (row / height - 1/2) after the middle
-    row. They are first rectified to the time of the middle row (``core/frames/rolling_shutter.py``).
+    Depth images are first rectified to their middle row (``core/frames/rolling_shutter.py``).
 
     Attributes:
         camera: Intrinsics of the colour camera; its ``depth_scale`` has no meaning.
         T_color_depth: (4, 4) maps points of the depth camera into the colour camera.
-        delay: Time of the middle row of the colour image minus time of the middle row of the depth image, beyond the
-            time stamps, s.
-        readout: Time from the first to the last row of the colour image (rolling shutter) minus the readout of the
-            depth image, s. 0 if both rows of a pixel are taken together.
+        delay: Time of the colour image's middle row minus the depth image's, beyond the time stamps, s.
+        readout: Readout of the colour image (first to last row) minus the depth image's, s.
         sigma: (13,) standard deviations of ``PARAMETERS``, NaN if unknown.
         estimated: Names of the estimated parameters; the others are given.
-        depth_readout: Time from the first to the last row of the depth image (rolling shutter), s.
-        depth_late: Time by which the stamps of depth images are too late, s. An image is never stamped before it is
-            taken. Therefore a positive ``delay`` of independent stamps means late depth stamps.
-        vignetting: Logarithm of the brightness in the middle of the colour image over the brightness in its corners. It
-            grows with the squared distance to the middle.
-        vignetting_sigma: Standard deviation of the vignetting, NaN if unknown.
+        depth_readout: Readout of the depth image, s.
+        depth_late: Delay of depth stamps, s. No image is stamped before it is taken, so that a positive ``delay`` of
+            independent stamps means late depth stamps.
+        vignetting: Log ratio of brightness, centre over corners; grows with the squared distance.
+        vignetting_sigma: Its standard deviation, NaN if unknown.
         depth_readout_sigma: Standard deviation of ``depth_readout``, s.
-        notes: Sentences on the estimation, which are comments of the file.
+        notes: Sentences on the estimation.
     """
 
     camera: Camera
@@ -92,26 +88,26 @@ class Calibration:
 
     @classmethod
     def registered(cls, camera: Camera) -> "Calibration":
-        """Calibration of colour that is registered to depth and taken at the same time; it changes nothing."""
+        """Calibration of registered, simultaneous colour."""
         return cls(replace(camera, distortion=()))
 
     def is_registered(self, depth_camera: Camera) -> bool:
-        """Whether the pixels of both images correspond with equal brightness, apart from time stamps."""
+        """Whether both images correspond with equal brightness, apart from time stamps."""
         one, other = self.camera, depth_camera
         same = (one.fx, one.fy, one.cx, one.cy, one.shape) == (other.fx, other.fy, other.cx, other.cy, other.shape)
         plain = self.delay == 0 and self.readout == 0 and self.vignetting == 0
         return same and plain and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
     def time_sigma(self, assumed: float) -> float:
-        """Standard deviation of the time between colour and depth of a pixel, seconds. If the timing was estimated:
-        root of the variances of the delay and of both row times (sigma / sqrt 12). Otherwise ``assumed``."""
+        """Standard deviation of the time between colour and depth of a pixel, seconds. Estimated: root of the variances
+        of the delay and of both row times (sigma / sqrt 12); else ``assumed``."""
         if not {"delay", "depth_readout"} & set(self.estimated) or np.isnan(self.depth_readout_sigma):
             return assumed
         delay, readout = (self.sigma[PARAMETERS.index(name)] for name in ("delay", "readout"))
         return float(np.linalg.norm([delay, readout / np.sqrt(12), self.depth_readout_sigma / np.sqrt(12)]))
 
     def is_instant(self, offset: float) -> bool:
-        """Whether a colour image with this time stamp (s after the depth's) was taken together with the depth."""
+        """Whether colour with this time stamp (s after the depth's) was taken with the depth."""
         return self.delay + offset == 0 and self.readout == 0
 
     @property
@@ -122,14 +118,14 @@ class Calibration:
         return out
 
     def with_depth_readout(self, depth_readout: float) -> "Calibration":
-        """The same colour camera with another readout of the depth camera, seconds. An estimated colour readout
-        keeps the absolute times of its rows, a given one their times relative to the depth image."""
+        """The same colour camera with another readout of the depth camera, seconds. An estimated colour readout keeps
+        its absolute row times, a given one its relative ones."""
         known = "readout" in self.estimated
         readout = self.readout + self.depth_readout - depth_readout if known else self.readout
         return replace(self, readout=readout, depth_readout=depth_readout)
 
     def retract(self, step: NDArray[np.float64]) -> "Calibration":
-        """Calibration after a step (13,) of ``PARAMETERS``; rotation and translation are updated in colour axes."""
+        """Calibration after a step (13,) of ``PARAMETERS``, colour axes."""
         camera, factor = self.camera, float(np.exp(step[6]))
         lens = self.lens + np.array([*step[9:11], 0.0, 0.0, 0.0])
         return replace(
@@ -148,7 +144,7 @@ class Calibration:
         )
 
     def step_to(self, other: "Calibration") -> NDArray[np.float64]:
-        """Step (13,) with ``self.retract(step)`` equal to ``other``, for cameras of equal aspect ratio."""
+        """Step (13,) with ``self.retract(step)`` equal to ``other``."""
         R = other.T_color_depth[:3, :3] @ self.T_color_depth[:3, :3].T
         return np.array(
             [
@@ -170,7 +166,7 @@ class Calibration:
         return dict(zip(PARAMETERS, self.sigma.tolist(), strict=True)) | others
 
     def tree(self) -> dict[str, Any]:
-        """Nested dictionary of numbers, lists and words, as in the file and in metrics.json, without NaN."""
+        """Nested dictionary, as in the file and in metrics.json, without NaN."""
         sigma = {name: value for name, value in self.sigmas.items() if np.isfinite(value)}
         camera = asdict(self.camera) | {"distortion": list(self.camera.distortion)}
         del camera["depth_scale"]

@@ -11,12 +11,11 @@ from dudmap.errors import DatasetError
 
 Scalar = TypeVar("Scalar", bound=np.floating)
 LARGEST_PIXELS = 2**26
-"""Largest number of pixels of an image, 8192x8192; phone images have up to 50 million."""
+"""Pixels of an image, 8192x8192."""
 SMALLEST_FOCAL, LARGEST_COORDINATE = 1e-2, 1e6
-"""Smallest focal length, and largest focal length and principal point, pixels: views of almost 180 and of a
-thousandth of a degree."""
+"""Smallest focal length, and largest focal length and principal point, pixels."""
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e9
-"""Units of depth per metre, from kilometres to nanometres. 16-bit values stay finite in this range."""
+"""Units of depth per metre, from kilometres to nanometres."""
 
 
 @dataclass(frozen=True)
@@ -27,9 +26,9 @@ class Camera:
         fx, fy: Focal lengths in pixels.
         cx, cy: Principal point in pixels.
         width, height: Image size in pixels.
-        depth_scale: Units of 16-bit depth images per metre; 1000 = millimetres, the unit of most sensors.
-        distortion: Coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of the Brown-Conrady model (thesis eq. 3.87, 3.88).
-            k4 to k6 form its denominator. Empty for none.
+        depth_scale: Units of 16-bit depth images per metre; 1000 = millimetres.
+        distortion: k1, k2, p1, p2[, k3[, k4, k5, k6]] of the Brown-Conrady model (thesis eq. 3.87, 3.88); empty for
+            none.
     """
 
     fx: float
@@ -95,7 +94,7 @@ class Camera:
         return self.height, self.width
 
     def scaled(self, level: int) -> "Camera":
-        """Camera of the image after ``level`` halvings by 2x2 blocks; a pixel lies at the centre of its block."""
+        """Camera of the image halved ``level`` times by 2x2 blocks."""
         return _scaled(self, level)
 
     def resized(self, width: int, height: int) -> "Camera":
@@ -112,20 +111,20 @@ class Camera:
         )
 
     def backproject(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Points (H, W, 3) in metres, camera frame, of a depth image (H, W); the origin for pixels without depth."""
+        """Points (H, W, 3), metres, camera frame, of a depth image (H, W); the origin without depth."""
         u = (np.arange(depth.shape[1], dtype=np.float32) - np.float32(self.cx)) / np.float32(self.fx)
         v = (np.arange(depth.shape[0], dtype=np.float32) - np.float32(self.cy)) / np.float32(self.fy)
         z = depth.astype(np.float32)
         return np.stack([z * u[None, :], z * v[:, None], z], axis=-1).astype(np.float32, copy=False)
 
     def points(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Scalar]) -> NDArray[Scalar]:
-        """Points (n, 3) in metres, camera frame, at pixels u, v (n,) with depths z (n,), in the precision of ``z``."""
+        """Points (n, 3), metres, camera frame, at pixels u, v (n,) with depths z (n,)."""
         out = np.empty((len(z), 3), z.dtype)
         out[:, 0], out[:, 1], out[:, 2] = (u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z
         return out
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixel coordinates (..., 2) of points (..., 3) in the camera frame; points with z <= 0 give NaN (eq. 4.4)."""
+        """Pixels (..., 2) of points (..., 3), camera frame; NaN for z <= 0 (eq. 4.4)."""
         points = np.asarray(points, dtype=np.float64)
         z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
         return np.stack(
@@ -136,8 +135,8 @@ class Camera:
     def nearest_pixels(
         self, points: NDArray[np.floating], border: int = 0
     ) -> tuple[NDArray[np.intp], NDArray[np.int64], NDArray[np.int64]]:
-        """Indices of the points (n, 3), camera frame, that project into the image inside ``border`` pixels, and
-        their nearest pixels u, v."""
+        """Indices of points (n, 3), camera frame, that project inside ``border`` pixels, and their nearest pixels u,
+        v."""
         pixels = np.rint(self.project(points))
         inside = np.all((pixels >= border) & (pixels < (self.width - border, self.height - border)), axis=1)
         u, v = pixels[inside].astype(np.int64).T

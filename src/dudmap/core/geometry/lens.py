@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.camera import Camera
 
 BEHIND = 0.03
-"""Share by which a surface must be nearer to hide another one: two standard deviations of a depth camera at 4 m,
-doubled for pixels between pixels."""
+"""Share by which a surface must be nearer to hide another: two standard deviations at 4 m, doubled."""
 
 
 class Lens:
@@ -67,16 +66,15 @@ class OtherView:
         self._spread = max(1, int(np.ceil(max(other.fx / one.fx, other.fy / one.fy))))
 
     def depth(self, depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Depth (h, w), metres, of a depth image (H, W) in the second camera, 0 without a measurement.
-        ``T_color_depth`` (4, 4) maps points of the depth camera to the second camera."""
+        """Depth (h, w), metres, of a depth image (H, W) in the second camera, 0 = none. ``T_color_depth``: (4, 4)."""
         rows, columns = np.nonzero(depth > 0)
         return self._splatted(rows, columns, depth[rows, columns], T_color_depth)
 
     def mask(
         self, mask: NDArray[np.bool_], depth: NDArray[np.float32], T_color_depth: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of the second camera that show the surface marked by a mask (H, W) of the depth camera,
-        unless hidden. Marked pixels without depth take the depth of the nearest marked pixel."""
+        """Pixels (h, w) of the second camera that show the masked surface (H, W), unless hidden. Pixels without depth
+        take the nearest marked pixel's."""
         from scipy.ndimage import binary_closing, distance_transform_edt
 
         marked = mask & (depth > 0)
@@ -93,7 +91,7 @@ class OtherView:
     def _splatted(
         self, rows: NDArray[np.intp], columns: NDArray[np.intp], z: NDArray[np.float32], T: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Nearest depths (h, w) of pixels (n,); each covers its own width in the second camera."""
+        """Nearest depths of pixels, each as wide as itself."""
         points = self.depth_lens.points(rows, columns, z.astype(np.float64))
         uv, depths = self.color_lens.project(points @ T[:3, :3].T + T[:3, 3])
         order = np.argsort(-depths)  # the nearest is written last

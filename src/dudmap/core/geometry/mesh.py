@@ -76,7 +76,7 @@ class Mesh:
 
     @classmethod
     def _load_ply(cls, path: Path) -> "Mesh | None":
-        """Read a file that ``save`` wrote, else None; trimesh takes 2 s for a million triangles."""
+        """Read a file that ``save`` wrote, else None; faster than trimesh."""
         layout = ply_layout(path)
         if layout is None:
             return None
@@ -151,7 +151,7 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
 
 
 def component_of_vertices(mesh: Mesh) -> NDArray[np.int32]:
-    """Number (V,) of the connected component of each vertex."""
+    """Connected component (V,) of each vertex."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -171,7 +171,7 @@ def with_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:
 
 
 def ply_arrays(mesh: Mesh, first: int = 0) -> tuple[NDArray, NDArray]:
-    """Vertices and faces in the layout of a PLY file, in which the vertices of this mesh begin at number ``first``."""
+    """Vertices and faces in the layout of a PLY file; vertices begin at number ``first``."""
     vertex = np.empty(len(mesh.vertices), _PLY_VERTEX)
     vertex["xyz"], vertex["normal"], vertex["rgb"] = mesh.vertices, mesh.normals, mesh.colors
     face = np.empty(len(mesh.faces), _PLY_FACE)
@@ -180,7 +180,7 @@ def ply_arrays(mesh: Mesh, first: int = 0) -> tuple[NDArray, NDArray]:
 
 
 def ply_layout(path: Path) -> tuple[NDArray, NDArray] | None:
-    """Vertices and faces of a PLY file that ``Mesh.save`` wrote, mapped into memory; None for any other file.
+    """Vertices and faces of a PLY file of ``Mesh.save``, mapped into memory; None for any other file.
 
     Raises:
         MapError: The file is cut off.

@@ -16,7 +16,7 @@ FACES_AT_ONCE = 500_000
 
 
 def save_pieces(pieces: Iterable[Mesh], path: str | Path) -> tuple[int, int]:
-    """Write the union of meshes that share no vertices as a binary PLY file, with one mesh in memory at a time.
+    """Write the union of separate meshes as a binary PLY file, one in memory at a time.
 
     Returns:
         Numbers of vertices and faces.
@@ -46,7 +46,7 @@ def save_pieces(pieces: Iterable[Mesh], path: str | Path) -> tuple[int, int]:
 def load_simplified(path: str | Path, max_triangles: int) -> Mesh:
     """Read a PLY file of this package in parts, as a mesh of at most ``max_triangles``.
 
-    Vertex clustering first reduces each part to four times its share of the triangles, then their union.
+    Vertex clustering reduces each part to four times its share of triangles, then their union.
 
     Raises:
         MapError: The file is missing, or not a PLY file of this package.

@@ -1,7 +1,4 @@
-"""Mesh simplification by vertex clustering (Rossignac and Borrel 1993): the vertices of each grid cell become one.
-
-Colours belong to vertices: quadrics would leave few on a flat wall and lose its texture.
-"""
+"""Mesh simplification by vertex clustering (Rossignac and Borrel 1993), which keeps texture on flat walls."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +7,7 @@ from dudmap.core.geometry.mesh import Mesh
 
 
 def simplified(mesh: Mesh, max_triangles: int) -> Mesh:
-    """The mesh itself if it has at most ``max_triangles``, else a coarser mesh with at most as many."""
+    """The mesh, or a coarser one of at most ``max_triangles``."""
     count, cell, out = len(mesh.faces), mean_edge(mesh), mesh
     while count > max_triangles:
         # the number of triangles of a surface falls with the square of the cell size; 2 % as a margin
@@ -21,9 +18,8 @@ def simplified(mesh: Mesh, max_triangles: int) -> Mesh:
 
 
 def clustered(mesh: Mesh, cell: float) -> Mesh:
-    """Mesh in which all vertices in one cube of edge ``cell`` (metres) with normals in the same octant, which
-    separates sides of a wall, get their mean position, colour and normal. Triangles with two equal corners are
-    dropped."""
+    """Mesh in which vertices in one cube of edge ``cell`` (metres) with normals in one octant become their mean.
+    Degenerate triangles are dropped."""
     lowest = mesh.vertices.min(axis=0, initial=np.inf)
     cells = np.floor((mesh.vertices - lowest) / cell).astype(np.int64)
     octant = (mesh.normals > 0) @ np.array([4, 2, 1])

@@ -1,4 +1,4 @@
-"""Text files of camera poses in the formats of TUM, EuRoC and KITTI, and recognition of the format."""
+"""Text files of camera poses in the formats of TUM, EuRoC and KITTI."""
 
 import math
 import re
@@ -17,17 +17,15 @@ from dudmap.input_files import read_text
 
 NANOSECONDS = UNITS[-1]
 LARGEST_ERROR = 0.02
-"""Largest difference of a quaternion's length from 1, and of a rotation's products: rounding to two digits."""
+"""Error of a quaternion's length and of a rotation's products: rounding to two digits."""
 
 
 SAMPLED = 1000
 
 
 class PoseFormat(NamedTuple):
-    """A format: its name, the columns of a row, and the indices of ``timestamp x y z qx qy qz qw`` among them.
-
-    ``places`` is empty for matrices without times.
-    """
+    """A format: name, columns of a row, and indices of ``timestamp x y z qx qy qz qw``; ``places`` is empty for
+    matrices without times."""
 
     name: str
     columns: str
@@ -55,13 +53,13 @@ class PoseFile(NamedTuple):
 def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     """Format of a file.
 
-    The header decides if it names the columns. Without such a header:
+    A header that names the columns decides. Otherwise:
     - Lines of 12 or 16 numbers that contain a rotation are KITTI.
     - Numbers separated by blanks are TUM.
     - Numbers separated by commas with times in nanoseconds are EuRoC.
 
     Args:
-        option: Name of the option that gives the format, for messages.
+        option: Option that gives the format, for messages.
 
     Raises:
         DatasetError: The file cannot be read, or its format is not clear.
@@ -97,8 +95,6 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
 
 def read_poses(path: Path, name: str | None = None, *, optional: bool = False, option: str = "--format") -> PoseFile:
     """Poses of a file in the named or recognised format.
-
-    Comments and a header are skipped; times in another unit than seconds are converted.
 
     Args:
         name: One of ``FORMATS``; None recognises the format.
@@ -140,7 +136,7 @@ def read_poses(path: Path, name: str | None = None, *, optional: bool = False, o
 
 
 def _named_order(line: str) -> str:
-    """Last letters of the names of columns two to eight of a header; empty for other lines."""
+    """Last letters of the names of columns two to eight of a header."""
     names = re.sub(r"\[.*?\]|\(.*?\)", "", line.lower()).strip("#, ")
     columns = [name.strip() for name in names.split(",")] if "," in names else names.split()
     letters = "".join(name[-1:] for name in columns[1:8])

@@ -14,7 +14,7 @@ from dudmap.errors import FrameError
 Matrix = NDArray[np.float64]
 IDENTITY = np.eye(3)
 SMALL = 1e-8
-"""Squared angle below which a rotation is computed by the Taylor series."""
+"""Squared angle below which the Taylor series is used."""
 
 
 def hat(omega: Matrix) -> Matrix:
@@ -26,10 +26,7 @@ def hat(omega: Matrix) -> Matrix:
 
 
 def exp(xi: Matrix) -> Matrix:
-    """Matrix exponential of a twist (6,): the rigid motion (4, 4) after unit time (thesis eq. 4.30).
-
-    Satisfies ``exp(log(T)) == T`` and ``exp(0) == identity``.
-    """
+    """Rigid motion (4, 4) of a twist (6,) after unit time (thesis eq. 4.30)."""
     xi = np.asarray(xi, dtype=np.float64)
     v, omega = xi[:3], xi[3:]
     theta_squared = float(omega @ omega)
@@ -151,13 +148,12 @@ def rotation_angles(Ts: Matrix) -> Matrix:
 
 
 def _turns(R: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """Rotation axes (n, 3) times twice the sine of the angle, and twice the sines and cosines (n,)."""
     axes = R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]]
     return axes, np.linalg.norm(axes, axis=1), np.trace(R, axis1=1, axis2=2) - 1
 
 
 def interpolate(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:
-    """Motion on the screw from ``T_a`` (share 0) to ``T_b`` (share 1)."""
+    """Motion on the screw from ``T_a`` (0) to ``T_b`` (1)."""
     return T_a @ exp(share * log(inverse(T_a) @ T_b))
 
 
@@ -181,7 +177,7 @@ def rotation_to_quat_xyzw(R: Matrix) -> Matrix:
 
 
 def quat_xyzw_to_rotation(quat_xyzw: Matrix) -> Matrix:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in the order x, y, z, w; they need not be normalised."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), x, y, z, w, of any length."""
     quats = np.asarray(quat_xyzw, dtype=np.float64)
     x, y, z, w = np.moveaxis(quats / np.linalg.norm(quats, axis=-1, keepdims=True), -1, 0)
     rows = [
@@ -193,7 +189,7 @@ def quat_xyzw_to_rotation(quat_xyzw: Matrix) -> Matrix:
 
 
 def nearest_rotation(R: Matrix) -> Matrix:
-    """Closest rotations to ``R`` (..., 3, 3) in the Frobenius norm; removes the drift of repeated products."""
+    """Closest rotations to ``R`` (..., 3, 3) in the Frobenius norm."""
     U, _, V_t = np.linalg.svd(R)
     U[..., 2] *= np.sign(np.linalg.det(U @ V_t))[..., None]
     return U @ V_t
@@ -224,12 +220,12 @@ def small_adjoint(xi: Matrix) -> Matrix:
 
 
 def interpolate_in_time(timestamps: Matrix, Ts: Matrix, timestamp: float) -> Matrix:
-    """Motion (4, 4) at a time, on the screw between its two temporal neighbours; the nearest motion outside the range.
+    """Motion (4, 4) at a time on the screw between its neighbours; the nearest one outside the range.
 
     Args:
         timestamps: (n,) increasing, n > 0.
         Ts: (n, 4, 4).
-        timestamp: Time of the motion.
+        timestamp: The time.
     """
     after = int(np.searchsorted(timestamps, timestamp))
     if after == len(timestamps):
@@ -253,7 +249,7 @@ def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, a
 
 
 LARGEST_SKEW = 0.02
-"""Largest difference of the products of a rotation's rows from 0 and 1 that rounding to two digits explains."""
+"""Error of the products of a rotation's rows that rounding to two digits explains."""
 
 
 def checked_pose(T: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Units of time stamps: exports of ROS and of cameras use nanoseconds, microseconds or milliseconds."""
+"""Units of time stamps: nanoseconds, microseconds, milliseconds or seconds."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ CENTURY = (1e9, 4.1e9)
 LONGEST_STEP = 1000.0
 """Largest plausible median time between two rows, seconds."""
 SLOWEST_COUNT = 10.0
-"""Largest median step of stamps in seconds or of counters; milliseconds would be 100 images a second."""
+"""Largest median step of stamps in seconds or of counters."""
 
 
 class TimeUnit(NamedTuple):
@@ -27,8 +27,8 @@ UNITS = (SECONDS, TimeUnit("milliseconds", 1e3), TimeUnit("microseconds", 1e6), 
 def time_unit(stamps: ArrayLike) -> TimeUnit:
     """Unit of time stamps (N,), in any order.
 
-    If all stamps in one of the units lie in this century, it is the unit. Otherwise the median step decides: at 1 to
-    1000 images a second at most 1 s, 10^3 ms, 10^6 us or 10^9 ns.
+    The unit that places all stamps in this century. Else the median step decides: at 1 to 1000 images a second at most
+    1 s, 10^3 ms, 10^6 us or 10^9 ns.
     """
     values = np.sort(np.asarray(stamps, dtype=np.float64))
     steps = np.diff(values)

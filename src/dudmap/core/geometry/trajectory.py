@@ -15,7 +15,7 @@ from dudmap.errors import DatasetError
 
 TUM_HEADER = "# timestamp tx ty tz qx qy qz qw"
 LARGEST_STEP = 0.15
-"""Largest time between two poses for which constant velocity is assumed, seconds."""
+"""Longest time of assumed constant velocity, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Trajectory:
     Attributes:
         timestamps: (N,) float64, seconds, strictly increasing.
         Ts_world_camera: (N, 4, 4) float64.
-        remarks: Sentences on the assumed unit of time and on skipped rows.
+        remarks: On the assumed unit and skipped rows.
     """
 
     timestamps: NDArray[np.float64]
@@ -61,7 +61,7 @@ class Trajectory:
         return cls(stamps, Ts)
 
     def interpolate(self, timestamp: float) -> NDArray[np.float64]:
-        """Pose (4, 4) at a time within the trajectory, on the screw between its two neighbours.
+        """Pose (4, 4) on the screw between its two neighbours.
 
         Raises:
             DatasetError: The time lies outside the trajectory.
@@ -71,10 +71,10 @@ class Trajectory:
         return se3.interpolate_in_time(self.timestamps, self.Ts_world_camera, timestamp).copy()
 
     def after(self, seconds: float | NDArray[np.float64]) -> "Trajectory":
-        """Poses ``seconds`` (a number or (N,)) after the time stamps, or before them for negative numbers.
+        """Poses ``seconds`` (a number or (N,)) after the time stamps.
 
-        They lie on the screw to the neighbouring pose in that direction. At the ends and at gaps longer than
-        ``LARGEST_STEP`` they use the screw of the opposite side. Without a near neighbour the pose does not move.
+        On the screw to the next pose; at ends and gaps longer than ``LARGEST_STEP`` on the opposite side's. Without a
+        near neighbour unchanged.
         """
         seconds = np.broadcast_to(seconds, len(self))[:, None]
         if not seconds.any() or len(self) < 2:
@@ -90,7 +90,7 @@ class Trajectory:
         return Trajectory(self.timestamps, self.Ts_world_camera @ se3.exp_all(seconds * twists))
 
     def save(self, path: str | Path) -> None:
-        """Write TUM text: ``timestamp tx ty tz qx qy qz qw``, camera to world, one pose a line."""
+        """Write TUM text ``timestamp tx ty tz qx qy qz qw``, camera to world."""
         lines = [TUM_HEADER]
         for stamp, T in zip(self.timestamps, self.Ts_world_camera, strict=True):
             numbers = (*T[:3, 3], *se3.rotation_to_quat_xyzw(T[:3, :3]))
@@ -115,8 +115,8 @@ class Trajectory:
             optional: Skip rows that are not a pose, and count them in ``remarks``.
 
         Raises:
-            DatasetError: The file is missing, or its format is not clear. It has no pose, no times, or, unless
-                ``optional``, a row that is not a pose.
+            DatasetError: The file is missing or of unclear format, or has no pose, no times, or, unless ``optional``, a
+                wrong row.
         """
         path = Path(path)
         found = read_poses(path, format, optional=optional)

@@ -26,32 +26,31 @@ from dudmap.core.tracking.tracker import Tracker, TrackingResult
 RULES = RegistrationRules(damping=1e-4, min_overlap=0.1, min_condition=1e-6, min_information=0.0)
 """Rules for an object: it fills a small part of the view and may turn about an axis of symmetry."""
 MAX_OBJECTS = 4
-"""Largest number of objects registered in one frame; each costs a few milliseconds and some megabytes."""
+"""Objects registered in one frame."""
 MAX_MESHES = 50
-"""Largest number of meshes of objects that are no longer tracked."""
+"""Meshes of objects that are no longer tracked."""
 MAX_SEEN_THROUGH = 0.08
-"""Largest share of a rigid object's surface that a frame may see through."""
+"""Largest share of a rigid object's surface that a frame sees through."""
 MAX_OFF_SURFACE = 0.25
-"""Largest share of a rigid object's depth measurements that may contradict its map."""
+"""Largest share of a rigid object's measurements that contradict its map."""
 YOUNG_FRAMES = 10
-"""Fused frames after which a misfit counts against rigidity; younger maps restart, also if much more of the object
-comes into view."""
+"""Fused frames after which a misfit counts against rigidity; younger maps restart."""
 GROWN = 1.5
 """Visible surface, relative to the start of the map, that restarts a young map."""
 MAX_RESTARTS = 20
 """Largest number of restarts of a map."""
 COLOR_SHARE = 0.3
-"""Weight of intensity relative to camera registration: shading changes on a rotating object."""
+"""Weight of intensity relative to the camera's: shading changes on rotating objects."""
 MAX_POINTS = 2000
-"""Number of surface points of an object in the check for being seen through."""
+"""Surface points in the check for being seen through."""
 MIN_PIXELS = 60
-"""Smallest number of pixels of a registered object: ten per degree of freedom of its pose."""
+"""Fewest pixels of an object: ten per degree of freedom."""
 MAX_PIXELS = 16000
-"""Largest number of pixels of an object in registration and fusion; a larger view is halved."""
+"""Pixels of an object in registration and fusion; a larger view is halved."""
 MIN_SIZE = 16 << 3
-"""Smallest width and height of the crop, pixels: three halvings leave at least 16 pixels."""
+"""Width and height of the crop, pixels: at least 16 after three halvings."""
 RIM = 0.05
-"""Width of the excluded mask border, share of the mask's size: grazing angles are noisy."""
+"""Excluded mask border, share of the mask's size, because of grazing angles."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +81,9 @@ class ObjectView:
 def crop_object(
     observation: Observation, mover: Mover, level: Level, exposure: tuple[float, float]
 ) -> ObjectView | None:
-    """Crop of a frame around an object, halved until at most MAX_PIXELS show it; None if the object is too small.
+    """Crop of a frame around an object, at most MAX_PIXELS of it; None if the object is too small.
 
-    The mask of the object belongs to ``level``. ``exposure``: gain and offset for the frame's intensities.
+    The mask belongs to ``level``. ``exposure``: gain and offset for the frame's intensities.
     """
     import cv2
 
@@ -128,7 +127,6 @@ def crop_object(
 
 
 def _padded_range(indices: NDArray[np.int64], shortest: int, size: int) -> slice:
-    """Range within 0 to ``size`` around sorted indices, padded by 1, at least ``shortest`` long."""
     start, stop = int(indices[0]) - 1, int(indices[-1]) + 2
     missing = max(0, shortest - (stop - start))
     start, stop = start - missing // 2, stop + (missing + 1) // 2
@@ -182,8 +180,7 @@ class ObjectFusion(Stateful):
     ) -> list[Mover]:
         """Register and fuse the objects of a tracked frame, whose masks belong to ``level``; return the objects.
 
-        An established object gets the velocity of the centre of its map: the visible upper half of a rolling ball is
-        faster.
+        An established object gets the velocity of its map's centre.
         """
         now = observation.timestamp
         for id, track in list(self._tracks.items()):
@@ -209,7 +206,7 @@ class ObjectFusion(Stateful):
         return [self._with_velocity(mover, now) for mover in movers]
 
     def _with_velocity(self, mover: Mover, now: float) -> Mover:
-        """Object with the velocity of its map's centre: slope of the recent positions."""
+        """Object with the velocity of its map's centre."""
         track = self._tracks.get(mover.id)
         if track is None or len(track.Ts_camera_object) < YOUNG_FRAMES:
             return mover
@@ -255,7 +252,7 @@ class ObjectFusion(Stateful):
         observation: Observation,
         T_world_camera: NDArray[np.float64],
     ) -> None:
-        """Register a frame to the object's map; fuse it if it is consistent with the map."""
+        """Register a frame to the object's map; fuse it if consistent."""
         now, duration = observation.timestamp, observation.timestamp - track.last_seen
         still = np.zeros(3)
         velocities = (
@@ -289,10 +286,6 @@ class ObjectFusion(Stateful):
             self._fuse(track, view, T_object_camera, now)
 
     def _align(self, volume: ObjectVolume, view: ObjectView, guesses: list[NDArray[np.float64]]) -> TrackingResult:
-        """Pose T_object_camera by registration from the guess with the lowest cost.
-
-        A measurement off the map at that guess shows a new side and gets weight 0: its cost would pull the object back.
-        """
         volume.look_at(guesses[0])
         systems = [self.tracker.linearize(volume, view.levels[0], T, view.weights[0]) for T in guesses]
         T = guesses[int(np.argmin([system.cost for system in systems]))]

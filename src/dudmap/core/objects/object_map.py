@@ -1,4 +1,4 @@
-"""Map and poses of one moving object while it is tracked, and the test of its rigidity."""
+"""Map and poses of a tracked object, and the test of its rigidity."""
 
 from dataclasses import dataclass, field, replace
 
@@ -12,17 +12,17 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 
 EXTENT = 1.0
-"""Depth range of the window of an object's map, reference depths: a cube of about 2.5 m in a room."""
+"""Depth range of an object's window, reference depths: 2.5 m in a room."""
 MIN_FRAMES = 10
-"""Smallest number of registered frames that prove rigidity."""
+"""Registered frames that prove rigidity."""
 MIN_DURATION = 0.5
-"""Shortest time that proves rigidity, seconds."""
+"""Seconds that prove rigidity."""
 MAX_MISFITS = 0.3
 """Largest share of registered frames that may contradict the map of a rigid object."""
 MIN_DISPLACEMENT = 0.03
 """Smallest displacement of a moving object, reference depths."""
 MIN_COMPONENT = 0.05
-"""Smallest kept component of a mesh, as a share of the vertices of the largest component."""
+"""Smallest kept component, share of the largest one's vertices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,7 @@ class RigidObject:
 
     Attributes:
         rigid: Whether it is one rigid object that has moved.
-        mesh: Its shape, metres, object frame, or None. The origin is the centre of the mesh's box; the axes are the
-            world's at first sight.
+        mesh: Its shape, metres, object frame, or None. Origin: centre of the box; axes: the world's at first sight.
         trajectory: Its poses T_world_object by the current camera poses, or None.
     """
 
@@ -45,7 +44,7 @@ class RigidObject:
 
 
 class ObjectVolume(TsdfVolume):
-    """Map of an object: its window stays at the object's origin, and it is not carved."""
+    """Map of an object, without carving; its window stays at the object's origin."""
 
     def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
         extent, still = EXTENT * sensor.reference_depth, config.model_copy(update={"carving": False})
@@ -70,9 +69,9 @@ class ObjectTrack:
         velocity: (6,) of the origin and of the rotation, m/s and rad/s, world axes.
         Ts_camera_object: Poses (4, 4) of the fused frames, by time.
         points: (n, 3) float32, a sample of the fused surface, object frame, metres.
-        max_displacement: Largest displacement of its surface since the start of the map, metres.
+        max_displacement: Of its surface since the start of the map, metres.
         recent_poses: Times and poses T_world_object of the last ``velocity_window`` seconds.
-        restarts: Misfit that caused each restart of the map; empty for a larger view.
+        restarts: Misfit of each restart; empty for a larger view.
     """
 
     id: int
@@ -92,7 +91,7 @@ class ObjectTrack:
     restarts: tuple[str, ...] = ()
 
     def rejection_reason(self, *, final: bool = True) -> str:
-        """Reason against rigidity, empty if the object is rigid; missing evidence is a reason only if ``final``."""
+        """Reason against rigidity, empty if rigid; missing evidence counts only if ``final``."""
         frames, contradicting = self.registrations, len(self.misfits)
         if frames >= MIN_FRAMES and contradicting > MAX_MISFITS * frames:
             return f"not rigid: {contradicting} of {frames} frames do not fit, the last: {self.misfits[-1]}"
@@ -109,7 +108,7 @@ class ObjectTrack:
         return ""
 
     def result(self) -> tuple[RigidObject, dict[float, NDArray[np.float64]]]:
-        """Result for the object, and its poses T_camera_object by time; no poses if it is not rigid."""
+        """Result, and its poses T_camera_object by time; none if not rigid."""
         reason, frames = self.rejection_reason(), len(self.Ts_camera_object)
         if reason:
             return RigidObject(self.id, False, reason, frames), {}

@@ -1,6 +1,6 @@
 """Moving objects with a lasting identity, position, extent and velocity (thesis section 7.1).
 
-An object is a spatially connected set of moving pixels, without a classifier; it never influences camera pose or map.
+An object is a connected set of moving pixels; it never influences camera pose or map.
 """
 
 from dataclasses import dataclass, field
@@ -24,22 +24,21 @@ from dudmap.core.objects.scene_flow import InstanceFrame, displacements
 from dudmap.core.state import Remembered, Stateful
 
 OUTLIER_SPEED = 0.7
-"""Largest deviation of a displacement's velocity from the median, reference depths per second; beyond, the mask
-changed."""
+"""Deviation of a velocity from the median beyond which the mask changed, reference depths per second."""
 MERGE_DISTANCE = 0.3
-"""Distance below which a small region is merged with a larger one, reference depths."""
+"""Distance below which a small region joins a larger one, reference depths."""
 MAX_JUMP = 0.4
-"""Largest distance from the predicted position in data association, reference depths; overlapping boxes also match."""
+"""Largest distance from the predicted position, reference depths; overlapping boxes also match."""
 MEMORY = 0.7
-"""Time for which an object out of view keeps its identity, seconds."""
+"""Seconds out of view for which an object keeps its identity."""
 VELOCITY_WINDOW = 0.2
-"""Time over which the velocity is averaged, seconds."""
+"""Averaging time of the velocity, seconds."""
 MAX_TRACKS = 255
-"""Largest number of tracked objects, whose numbers in an image are bytes."""
+"""Tracked objects, whose numbers are bytes."""
 ESTABLISHED_SHARE = 0.3
-"""Smallest part of an established object that stays separate, relative to the object."""
+"""Smallest separate part of an established object."""
 ESTABLISHED = 0.5
-"""Age after which separate objects stay separate when they touch, seconds."""
+"""Age after which touching objects stay separate, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +49,8 @@ class Mover:
         id: Number, at least 1, constant while the object is tracked.
         mask: (h, w) bool, at the resolution of the labels.
         points: (N, 3) float32, metres, world frame, of the mask pixels with depth.
-        centroid: (3,) metres, world frame, mean of the points: of the visible side, not of the object.
-        box: (2, 3) metres, world frame, smallest and largest coordinates, without the outermost 1 % of the points.
+        centroid: (3,) metres, world frame, mean of the visible points.
+        box: (2, 3) metres, world frame, without the outermost 1 % of the points.
         velocity: (3,) m/s, world frame; 0 in the first frame.
         age: Seconds since it was first seen.
     """
@@ -125,12 +124,12 @@ class _Shape:
 class ObjectTracker(Stateful):
     """Segments the moving pixels of each frame into objects and associates them with earlier objects.
 
-    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object of each pixel.
-    They also split the region of touching objects. Velocities are estimated over the last ``VELOCITY_WINDOW`` seconds:
+    The last frame's moving pixels, displaced by their velocities, predict the object of each pixel and split touching
+    objects. Velocities over the last ``VELOCITY_WINDOW`` seconds:
 
-    * A fully visible object: slope of a line through its positions (the surface of a rolling ball is faster).
-    * An object cut off by the image border or an occluder: mean of its frame-to-frame displacements without outliers.
-      Each is the median over pixels matched by forward-backward optical flow (Lucas and Kanade 1981).
+    * A fully visible object: slope of its positions.
+    * A cut-off object: mean frame-to-frame displacement without outliers, each the median over pixels matched by
+      optical flow (Lucas and Kanade 1981).
     """
 
     _tracks: Remembered[list[_Track]]
@@ -213,7 +212,7 @@ class ObjectTracker(Stateful):
     def _joined(
         self, numbers: NDArray[np.int32], predicted: NDArray[np.uint8], level: Level
     ) -> list[tuple[NDArray[np.intp], float]]:
-        """Pixels (n,) and surface of each object: a region with its fragments.
+        """Pixels and surface of each object: a region with near fragments of the same prediction, or much smaller ones.
 
         A fragment is near the object, and either has the same prediction or is much smaller.
         """
@@ -239,14 +238,11 @@ class ObjectTracker(Stateful):
         return [(np.sort(pixels), area) for pixels, area in objects if area >= self.config.min_area]
 
     def _is_old(self, track: _Track) -> bool:
-        """Whether an object has been seen for some time."""
         return track.last_seen - track.first_seen >= ESTABLISHED and track.area >= 2 * self.config.min_area
 
     def _associate(self, timestamp: float, objects: list[_Shape], predicted: NDArray[np.uint8]) -> list[_Track]:
-        """Track of each object, greedily by increasing cost: distance from the prediction - max_jump * shared pixels.
-
-        Candidates share more than 0.3 of the pixels, lie closer than ``max_jump`` or have overlapping boxes.
-        """
+        """Track of each object, greedily by increasing distance from the prediction - max_jump * shared pixels, among
+        similar places."""
         known, max_jump = list(self._tracks), MAX_JUMP * self.reference_depth
         found: dict[int, _Track] = {}
         if objects and known:
@@ -274,7 +270,7 @@ class ObjectTracker(Stateful):
         return [found[i] for i in range(len(objects))]
 
     def _update_velocity(self, track: _Track, measurement: _Measurement) -> None:
-        """Velocity: median of estimates from displacements and from slopes of positions."""
+        """Velocity: median of the estimates."""
         recent = [m for m in track.measurements if measurement.time - m.time < VELOCITY_WINDOW]
         track.measurements = [*recent, measurement]
         estimates = []

@@ -1,4 +1,4 @@
-"""Connected regions of moving pixels: the parts of which the moving objects of one frame consist."""
+"""Connected regions of moving pixels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,22 +10,22 @@ from dudmap.core.backends.cpu.labeling import grow_regions
 from dudmap.core.frames.observation import Level
 
 SAMPLES = 50
-"""Number of points that determine the box of a region."""
+"""Points that determine the box of a region."""
 MAX_REGIONS = 24
-"""Largest number of regions per frame; the regions with the most pixels are used."""
+"""Regions per frame, largest first."""
 MIN_SHARE = 12 / (160 * 120)
-"""Smallest region as a share of the image; smaller ones are noise: 12 pixels of a default label image."""
+"""Smallest region, share of the image: 12 pixels of a default label image."""
 OCCLUSION_GAP = 0.1
-"""Depth step at an object's border beyond which a nearer surface occludes the object, reference depths."""
+"""Depth step at an object's border that occludes it, reference depths."""
 
 
 @dataclass(frozen=True, eq=False)
 class Regions:
-    """Regions of moving pixels, connected in the image and in depth, the one with the most pixels first.
+    """Regions of moving pixels, connected in image and depth, largest first.
 
     Attributes:
         pixels: Per region (n,) indices into the flattened image, ascending.
-        areas: Per region the visible surface across the line of sight, square metres.
+        areas: Visible surface per region, square metres.
         gaps: (R, R) distance between the boxes of two regions, metres.
     """
 
@@ -64,7 +64,7 @@ def measured_regions(numbers: NDArray[np.int32], level: Level) -> Regions | None
 
 
 def split_between(region: NDArray[np.bool_], predicted: NDArray[np.uint8], objects: Sequence[int]) -> NDArray[np.int32]:
-    """Object of each pixel of a region (h, w): that of the nearest pixel in which one of ``objects`` is predicted."""
+    """Object of each pixel of a region (h, w): of the nearest pixel predicted as one of ``objects``."""
     import cv2
 
     certain = region & np.isin(predicted, objects)
@@ -78,14 +78,14 @@ def split_between(region: NDArray[np.bool_], predicted: NDArray[np.uint8], objec
 
 
 def trimmed_box(points: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Extent (2, 3) of points (n, 3) without the outermost 1 % on each side, which mix measurements of two surfaces."""
+    """Extent (2, 3) of points (n, 3) without the outermost 1 % on each side."""
     sample = np.sort(points[:: 1 + len(points) // 300], axis=0)
     cut = len(sample) // 100
     return sample[[cut, -1 - cut]].astype(np.float64)
 
 
 def is_fully_visible(mask: NDArray[np.bool_], depth: NDArray[np.float32], reference_depth: float = 1.0) -> bool:
-    """Whether an object (h, w) is cut off neither by the image border nor by an occluding surface."""
+    """Whether neither the image border nor an occluder cuts an object (h, w) off."""
     import cv2
 
     if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():

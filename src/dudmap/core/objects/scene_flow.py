@@ -11,9 +11,9 @@ from dudmap.core.frames.observation import Level, scaled_window
 from dudmap.core.frames.optical_flow import track_forward_backward
 
 PAIRED_PIXELS = 40
-"""Number of pixels of an object that are tracked into the last frame."""
+"""Pixels of an object tracked into the last frame."""
 FEWEST_PIXELS = 12
-"""Smallest number of matched pixels that determine the displacement of an object."""
+"""Matched pixels that determine a displacement."""
 WINDOW = 9
 """Edge of the matching window, pixels of an image WINDOW_WIDTH wide."""
 RETURN_PX = 0.5
@@ -43,8 +43,8 @@ def displacements(
 ) -> dict[int, NDArray[np.float64]]:
     """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow: metres, world frame.
 
-    ``objects``: pixels (n,) of each object in the frame ``now``, as indices into the flattened image. The result
-    contains the objects with enough matched pixels. Displacements longer than ``max_jump`` metres are mismatches.
+    ``objects``: pixels (n,) in ``now``, as flat indices. Displacements longer than ``max_jump`` metres are mismatches.
+    Displacements longer than ``max_jump`` metres are mismatches.
     """
     import cv2
 

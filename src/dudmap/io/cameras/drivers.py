@@ -23,19 +23,19 @@ from dudmap.io.cameras import CameraFrame, LiveCamera, driver
 from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 
 WIDTH, HEIGHT, RATE = 640, 480, 30
-"""Mode of both streams of a RealSense camera, supported by all of the D400 and L500 series."""
+"""Mode of both streams of a RealSense camera."""
 OAK_SIZE = (640, 400)
-"""Size of all images of an OAK: the mono cameras halved."""
+"""Size of all images of an OAK."""
 PATIENCE_MS = 200
-"""Interval of checks for a closed camera or the end of a recording, milliseconds."""
+"""Interval of checks for a closed camera or end of a recording, milliseconds."""
 LONGEST_SILENCE = 5.0
-"""Time without frames after which a camera is lost, seconds; the first frame takes up to 2 s."""
+"""Time without frames after which a camera is lost, seconds."""
 FRONT_CAMERA = 0
-"""Type of device of the front camera of an iPhone, whose images Record3D sends mirrored."""
+"""Device type of an iPhone's front camera, whose images are mirrored."""
 
 
 class _PolledCamera(LiveCamera):
-    """A camera whose driver is polled for frames; the lens distortion of each image is removed."""
+    """A camera whose driver is polled; lens distortion is removed."""
 
     kind = ""
     _lenses: tuple[Lens, Lens]
@@ -47,7 +47,7 @@ class _PolledCamera(LiveCamera):
 
     @abstractmethod
     def _poll(self) -> tuple[int, Any, Any] | None:
-        """Number, depth image and colour image of the next frame, None if there was none in ``PATIENCE_MS``."""
+        """Number, depth and colour of the next frame, None after ``PATIENCE_MS``."""
 
     @abstractmethod
     def _frame(self, depth: Any, color: Any) -> Frame:  # noqa: ANN401 - types of the driver
@@ -57,7 +57,6 @@ class _PolledCamera(LiveCamera):
         return False
 
     def read(self) -> CameraFrame | None:
-        """Next pair of depth and colour images."""
         silent_since = time.perf_counter()
         while not self._closed.is_set():
             with self._reading:
@@ -74,7 +73,6 @@ class _PolledCamera(LiveCamera):
         return None
 
     def close(self) -> None:
-        """Stop the camera."""
         if not self._closed.is_set():
             self._closed.set()
             with self._reading, suppress(RuntimeError):  # it may have stopped by itself
@@ -86,10 +84,10 @@ class _PolledCamera(LiveCamera):
 
 
 class RealSenseCamera(_PolledCamera):
-    """A RealSense camera by pyrealsense2 (Apache-2.0); colour is registered by its factory calibration.
+    """A RealSense camera by pyrealsense2; colour is registered by its factory calibration.
 
     Args:
-        file: Recording of a RealSense camera that is played in real time instead of a camera.
+        file: Recording that is played in real time instead.
     """
 
     kind = "RealSense"
@@ -130,7 +128,7 @@ class RealSenseCamera(_PolledCamera):
         return super().read()
 
     def preview(self, count: int) -> list[Frame]:
-        """Some frames; a recording pauses while the kernels are loaded."""
+        """Some frames; a recording pauses meanwhile."""
         frames = super().preview(count)
         self._pause()
         return frames
@@ -166,10 +164,7 @@ class RealSenseCamera(_PolledCamera):
 
 
 class OrbbecCamera(_PolledCamera):
-    """An Orbbec camera by pyorbbecsdk2; the Femto series has the sensors of the Azure Kinect.
-
-    Depth and colour are not registered; the factory calibration gives their poses.
-    """
+    """An Orbbec camera by pyorbbecsdk2, including Femto; depth and colour are not registered."""
 
     kind = "Orbbec"
 
@@ -227,7 +222,7 @@ def _motion(R: Any, t: Any) -> NDArray[np.float64]:  # noqa: ANN401
 
 
 class OakCamera(LiveCamera):
-    """An OAK camera by depthai 3 (MIT); depth is registered to colour, and both are rectified, in the camera."""
+    """An OAK camera by depthai 3; depth is registered to colour in the camera."""
 
     def __init__(self) -> None:
         dai = driver("depthai", "oak")
@@ -258,7 +253,7 @@ class OakCamera(LiveCamera):
         self._closed_error = dai.MessageQueue.QueueException
 
     def read(self) -> CameraFrame | None:
-        """Next pair of depth and colour images."""
+        """Next pair of images."""
         try:
             group = self._queue.get(timedelta(seconds=LONGEST_SILENCE))
         except self._closed_error:
@@ -281,11 +276,8 @@ class OakCamera(LiveCamera):
 
 
 class IPhoneCamera(LiveCamera):
-    """An iPhone or iPad that streams by USB with Record3D (package record3d, LGPL-2.1: only optional).
-
-    Its depth images are smaller and seen from the same place. Record3D sends no times; frames have their time of
-    arrival.
-    """
+    """An iPhone or iPad that streams by USB with Record3D (package record3d, LGPL-2.1: only optional); frames have
+    their time of arrival."""
 
     def __init__(self) -> None:
         record3d = driver("record3d", "iphone")
@@ -308,7 +300,7 @@ class IPhoneCamera(LiveCamera):
         self.calibration = None if calibration.is_registered(self.camera) else calibration
 
     def read(self) -> CameraFrame | None:
-        """Next pair of depth and colour images."""
+        """Next pair of images."""
         if not self._arrived.wait(LONGEST_SILENCE) and not self._stopped.is_set():
             raise CameraError(f"the iPhone sent no frame for {LONGEST_SILENCE:.0f} s; is Record3D still in front?")
         if self._stopped.is_set():

@@ -1,4 +1,4 @@
-"""Recording of live frames into an MCAP file of ROS 2 messages, in separate threads."""
+"""Recording of live frames into an MCAP file of ROS 2 messages, in threads."""
 
 import os
 import shutil
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
 
 AHEAD = 60
-"""Most frames that wait for the disk: two seconds of a camera, about 130 MB at 640x480."""
+"""Frames that wait for the disk: two seconds, about 130 MB at 640x480."""
 UNSAVED = 0.5
-"""Seconds after which a frame is on the disk, if the disk is fast enough."""
+"""Seconds after which a frame is on a fast disk."""
 COLOR, ALIGNED, DEPTH = "/camera/color", "/camera/aligned_depth_to_color", "/camera/depth"
-"""Namespaces of the topics ``image_raw`` and ``camera_info``; depth that is registered to colour is ``ALIGNED``."""
+"""Namespaces of the topics ``image_raw`` and ``camera_info``; ``ALIGNED``: depth registered to colour."""
 COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
 """Frames of reference (ROS REP 103: x right, y down, z forward)."""
 
@@ -33,12 +33,11 @@ COLOR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_f
 class Recorder:
     """Writes frames without loss to an MCAP file that ``dudmap run`` and ROS 2 read.
 
-    ``put`` never waits: frames that the disk is too slow for are dropped and counted. The file is written into
-    ``<name>.recording`` and moved when it is complete; after a kill all but the last ``UNSAVED`` seconds can be read
-    there.
+    ``put`` never waits: frames too fast for the disk are dropped and counted. The file is ``<name>.recording`` until
+    complete; after a kill it lacks at most ``UNSAVED`` seconds.
 
     Args:
-        path: The file; it must not exist and end in .mcap.
+        path: New .mcap file.
 
     Attributes:
         written, dropped: Numbers of frames.
@@ -75,7 +74,7 @@ class Recorder:
             thread.start()
 
     def put(self, frame: "Frame") -> None:
-        """Record a frame, or count it as dropped if too many wait already; never blocks."""
+        """Record a frame, or count it as dropped; never blocks."""
         try:
             self._queue.put_nowait(frame)
         except Full:
@@ -116,7 +115,6 @@ class Recorder:
                 self.dropped += 1
 
     def _bring_to_disk(self) -> None:
-        """Complete a chunk and wait for the disk, again and again."""
         while not self._closed.wait(UNSAVED) and self._error is None:
             try:
                 with self._lock:
@@ -126,7 +124,6 @@ class Recorder:
                 self._error = error
 
     def _write(self, frame: "Frame") -> None:
-        """Write images and camera_info; first also the place of the colour camera."""
         writer, types, calibration = self._writer, self._writer.types, self._calibration
         recorded = max(round(frame.timestamp * 1e9), self._last + 1)
         depth_frame, depth_space = (COLOR_FRAME, ALIGNED) if calibration is None else (DEPTH_FRAME, DEPTH)

@@ -1,4 +1,4 @@
-"""A recording as if it were a live camera: its frames arrive at the rate of the sensor."""
+"""A recording as if it were a live camera."""
 
 import time
 from threading import Event
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
 
 class ReplayCamera(LiveCamera):
-    """Delivers the frames of a recording at their times; the clock starts at the first ``read``.
+    """Delivers the frames of a recording at their times from the first ``read``.
 
-    Frames due for longer than ``MAX_WAIT`` are lost, as with a camera.
+    Frames due for longer than ``MAX_WAIT`` are lost.
 
     Args:
-        recording: Path of a recording in any format that is read, or the opened sequence.
+        recording: Path, or the opened sequence.
 
     Raises:
         DatasetError: The recording cannot be opened.
@@ -46,7 +46,7 @@ class ReplayCamera(LiveCamera):
         self._closed = Event()
 
     def read(self) -> CameraFrame | None:
-        """Next frame when it is due, None at the end."""
+        """Next frame when due, None at the end."""
         if self._start is None:
             self._start = time.perf_counter()
         if self._next >= len(self._times):

@@ -1,4 +1,4 @@
-"""Table of exporters: the suffix of the target, or its whole name, selects the format. Trajectories as text."""
+"""Table of exporters by suffix or name of the target. Trajectories as text."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ class Exporter:
     """A format that results can be written in.
 
     Attributes:
-        summary: Content of the file, for the help page.
+        summary: Content, for the help page.
         target: ``module:function`` of a function ``write(run, path, options) -> None``, imported on use.
-        options: Names of the fields of ``ExportOptions`` that it takes.
+        options: Fields of ``ExportOptions`` that it takes.
     """
 
     summary: str
@@ -27,7 +27,7 @@ class Exporter:
 
     @property
     def write(self) -> Callable[[RunContent, Path, ExportOptions], None]:
-        """Function that writes the results of a run; errors as in ``export_run``."""
+        """Function that writes a run; errors as in ``export_run``."""
         module, _, name = self.target.partition(":")
         return getattr(import_module(f"dudmap.io.exporting.{module}"), name)
 
@@ -72,11 +72,11 @@ def find_exporter(name: str) -> Exporter:
 
 
 def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None = None) -> Path:
-    """Write the results of a run folder in the format given by the name of ``to``; return the path.
+    """Write the results of a run folder in the format of the name ``to``; return the path.
 
     Raises:
-        ConfigError: The suffix is unknown, an option does not fit, or the format needs a library that is not installed.
-        DatasetError: The folder is no run folder, is incomplete, or was written by a newer version.
+        ConfigError: The suffix is unknown, an option does not fit, or a library is missing.
+        DatasetError: The folder is no run folder, incomplete, or newer.
         MapError: The map or the mesh cannot be read, or is empty.
         OSError: The file cannot be written.
     """
@@ -104,7 +104,7 @@ def write_tum(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_kitti(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the upper three rows of each pose, 12 numbers a line; the format has no times."""
+    """Write the upper three rows of each pose, 12 numbers a line, without times."""
     rows = [" ".join(f"{number:.9f}" for number in T[:3].reshape(-1)) for T in run.trajectory.Ts_world_camera]
     write_text(path, "\n".join(rows) + "\n")
 

@@ -1,4 +1,4 @@
-"""Level surfaces and the floor of a map, and axes that stand on it. A zero direction raises a ``ConfigError``."""
+"""Level surfaces and floor of a map, and axes that stand on it. A zero direction raises a ``ConfigError``."""
 
 from typing import NamedTuple
 
@@ -10,16 +10,16 @@ from dudmap.errors import ConfigError
 from dudmap.io.exporting.mesh_editing import face_vectors
 
 CONE = np.cos(np.radians(45))
-"""Cosine of the largest angle between the floor's normal and the mean up direction of the cameras."""
+"""Cosine of the largest angle between floor normal and mean up direction of the cameras."""
 PARALLEL = np.cos(np.radians(5))
-"""Cosine of the largest angle within one direction: the noise of a plane's triangles at 1 cm voxels."""
+"""Cosine of the largest angle within one direction: noise at 1 cm voxels."""
 CANDIDATES = 500
 LEAST_SHARE = 0.02
-"""Smallest share of the whole surface that must face up."""
+"""Smallest share of the surface that faces up."""
 LAYER = 0.05
-"""Half the thickness of a layer of one height, metres."""
+"""Half the thickness of a layer, metres."""
 FLOOR_SHARE = 0.1
-"""Smallest share of upward surface in the layer of the floor; the lowest such layer is the floor."""
+"""Smallest share of upward surface in the layer of the floor, the lowest such layer."""
 
 
 class Floor(NamedTuple):
@@ -35,10 +35,8 @@ class Floor(NamedTuple):
 
 
 def level_normal(mesh: Mesh, held: NDArray[np.float64], cone: float = CONE) -> NDArray[np.float64] | None:
-    """Most frequent surface normal (3,) near a direction (3,), None if none is frequent.
-
-    ``cone`` is the cosine of the largest angle between both.
-    """
+    """Most frequent surface normal (3,) near a direction (3,), None if none is frequent; ``cone``: cosine of the
+    largest angle."""
     vectors = face_vectors(mesh)
     areas = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)
     normals = vectors / areas[:, None]
@@ -76,10 +74,7 @@ def floor_height(mesh: Mesh, up: NDArray[np.float64]) -> float | None:
 
 
 def fitted(mesh: Mesh, floor: Floor) -> Floor:
-    """Least-squares plane through the vertices of the floor, in ever thinner layers, which exclude objects on it.
-
-    A mean of normals would be biased towards clutter.
-    """
+    """Least-squares plane through the floor's vertices, in ever thinner layers, which exclude objects."""
     for half in (2 * LAYER, LAYER, LAYER / 2, LAYER / 2):
         facing = mesh.normals @ floor.up > np.cos(np.radians(15))
         points = mesh.vertices[facing & (np.abs(mesh.vertices @ floor.up - floor.height) < half)].astype(np.float64)
@@ -93,16 +88,13 @@ def fitted(mesh: Mesh, floor: Floor) -> Floor:
 
 
 def y_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation (3, 3) from the world to axes with y up and the first camera's view direction towards -z."""
+    """Rotation (3, 3) from the world to y up and the first view towards -z."""
     back = -_across(up)
     return np.stack([np.cross(up, back), up, back])
 
 
 def z_up(floor: Floor) -> NDArray[np.float64]:
-    """Motion (4, 4) from the world to axes with z up from the floor, x along the first camera's view (REP 103).
-
-    The origin is on the floor below the first camera.
-    """
+    """Motion (4, 4) from the world to axes on the floor below the first camera: z up, x along its view (REP 103)."""
     forward = _across(floor.up)
     T = np.eye(4)
     T[:3, :3] = np.stack([forward, np.cross(floor.up, forward), floor.up])
@@ -111,7 +103,6 @@ def z_up(floor: Floor) -> NDArray[np.float64]:
 
 
 def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """View direction (0, 0, 1) without its part along ``up``, or the x axis if nothing is left."""
     forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
     if np.linalg.norm(forward) < 0.1:
         forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
@@ -119,7 +110,7 @@ def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def unit(vector: tuple[float, ...] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vector of length 1."""
+    """Unit vector."""
     values = np.asarray(vector, np.float64)
     length = float(np.linalg.norm(values))
     if not np.isfinite(length) or length < 1e-9:

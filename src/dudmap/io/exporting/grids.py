@@ -1,4 +1,4 @@
-"""Grids for robots: occupied, free and unknown space, distances to the surface, z up, and a 2D map for nav2."""
+"""Grids for robots: occupied, free and unknown space, distances to the surface, and a 2D map for nav2."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,16 +22,16 @@ from dudmap.io.exporting.up import Up, checked_floor, run_up
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
 """Cell values of ROS' ``nav_msgs/OccupancyGrid``."""
 LARGEST = 20_000_000
-"""Largest number of cells; distances then take about a minute and 1 GB."""
+"""Cells; distances then take about a minute and 1 GB."""
 BORDER = 2
 CHUNK = 1_000_000
 FORMAT = "dudmap grid 1"
 PIXELS = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
-"""Grey values of the cells in nav2's map saver."""
+"""Grey values of nav2's map saver."""
 FLOOR_LAYER = 0.1
-"""A surface within this height of the floor is floor, metres."""
+"""Surface below this height is floor, metres."""
 SEEN_SHARE = 0.5
-"""Smallest share of free cells for a free column without a visible floor."""
+"""Smallest share of free cells of a free column without visible floor."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +40,10 @@ class SpaceGrid:
 
     Attributes:
         occupancy: (X, Y, Z) int8, ``OCCUPIED``, ``FREE`` or ``UNKNOWN``.
-        behind: (X, Y, Z) bool, whether the centre of a cell lies behind an observed surface.
-        origin: (3,) lower corner of the first cell, metres, in the axes of the grid.
+        behind: (X, Y, Z) bool, whether a cell's centre lies behind an observed surface.
+        origin: (3,) lower corner of the first cell, metres, grid axes.
         resolution: Edge of a cell, metres.
-        T_grid_map: (4, 4) motion from the world of the map to the axes of the grid.
+        T_grid_map: (4, 4) world of the map to the grid axes.
     """
 
     occupancy: NDArray[np.int8]
@@ -56,11 +56,11 @@ class SpaceGrid:
     def of(cls, volume: TsdfVolume, mesh: Mesh, T_grid_map: NDArray[np.float64], resolution: float) -> "SpaceGrid":
         """Grid around a surface.
 
-        A cell is occupied if it contains a vertex; free if its centre was observed in front of a surface or in known
-        free space; else unknown.
+        A cell is occupied if it contains a vertex; free if its centre was observed in front of a surface or in free
+        space; else unknown.
 
         Args:
-            mesh: Surface of the map; vertices closer together than a cell.
+            mesh: Surface of the map, vertices closer than a cell.
             T_grid_map: (4, 4) axes of the grid.
             resolution: Edge of a cell, metres.
 
@@ -90,15 +90,14 @@ class SpaceGrid:
         return grid
 
     def _centres(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Numbers (n,) in C order and centres (n, 3), metres, of all cells, ``CHUNK`` at once."""
         for start in range(0, self.occupancy.size, CHUNK):
             cells = np.arange(start, min(start + CHUNK, self.occupancy.size))
             numbers = np.stack(np.unravel_index(cells, self.occupancy.shape), axis=1)
             yield cells, self.origin + (numbers + 0.5) * self.resolution
 
     def distances(self, mesh: Mesh) -> NDArray[np.float32]:
-        """Euclidean signed distance (X, Y, Z) of each centre to the nearest surface vertex, metres; negative behind
-        a surface. With vertices a voxel v apart, a distance d is at most v^2 / (4 d) too large."""
+        """Signed distance (X, Y, Z) of each centre to the nearest surface vertex, metres; negative behind a surface.
+        With vertices v apart, a distance d is at most v^2 / (4 d) too large."""
         from scipy.spatial import KDTree
 
         tree = KDTree(mesh.vertices @ self.T_grid_map[:3, :3].T + self.T_grid_map[:3, 3])
@@ -134,7 +133,7 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     - ``esdf``: (X, Y, Z) float32, metres.
     - ``origin``: (3,), lower corner of the first cell, metres.
     - ``resolution``: metres.
-    - ``T_grid_map``: (4, 4) world of the run to the axes of the grid: z up from the floor, x along the first view.
+    - ``T_grid_map``: (4, 4) world of the run to the grid: z up from the floor, x along the first view.
     """
     mesh, grid, _ = _grid(run, options)
     with atomic_file(path) as file:
@@ -172,8 +171,8 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:
-    """Occupancy (X, Y) between two heights above the floor, metres: occupied if any cell is; free if the floor was
-    seen or half of the cells are free; else unknown."""
+    """Occupancy (X, Y) between two heights above the floor, metres: occupied if any cell is; free with seen floor or
+    half of the cells free; else unknown."""
     z = grid.origin[2] + (np.arange(grid.occupancy.shape[2]) + 0.5) * grid.resolution
     inside = grid.occupancy[..., (z > heights[0]) & (z < heights[1])]
     floor = grid.occupancy[..., np.abs(z) <= max(FLOOR_LAYER, grid.resolution)]

@@ -1,6 +1,6 @@
-"""Parts of a mesh, closed holes and fewer triangles, for exports.
+"""Parts of a mesh, closed holes and fewer triangles.
 
-An option out of range raises a ``ConfigError``, an empty result a ``MapError``.
+A wrong option raises a ``ConfigError``, an empty result a ``MapError``.
 """
 
 from dataclasses import replace
@@ -17,7 +17,7 @@ PART = 65536
 
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:
-    """Mesh after all options that change it: crop, pieces, holes, triangles, in this order."""
+    """Mesh after crop, pieces, holes and triangles, in this order."""
     if options.crop is not None:
         mesh = cropped(mesh, options.crop)
     mesh = without_small_pieces(mesh, options.drop_pieces_below)
@@ -40,14 +40,14 @@ def cropped(mesh: Mesh, box: Box) -> Mesh:
 
 
 def without_small_pieces(mesh: Mesh, area: float = SPECK) -> Mesh:
-    """Mesh without the connected pieces whose surface is smaller than ``area``, square metres."""
+    """Mesh without connected pieces below ``area``, square metres."""
     piece = component_of_vertices(mesh)[mesh.faces[:, 0]]
     kept = np.bincount(piece, face_areas(mesh))[piece] >= area
     return mesh if kept.all() else with_faces(mesh, kept)
 
 
 def with_filled_holes(mesh: Mesh, longest: float) -> Mesh:
-    """Mesh whose holes with a border of at most ``longest`` metres are closed by triangles around their centres."""
+    """Mesh whose holes with a border of at most ``longest`` metres are closed."""
     loops = [loop for loop in border_loops(mesh.faces) if _length(mesh.vertices[loop]) <= longest]
     if not loops:
         return mesh
@@ -62,10 +62,8 @@ def with_filled_holes(mesh: Mesh, longest: float) -> Mesh:
 
 
 def border_loops(faces: NDArray[np.int32]) -> list[NDArray[np.int32]]:
-    """Closed borders of the surface, each as its vertices in the direction of the triangles' edges.
-
-    Borders that touch themselves in a vertex are omitted, because their holes are not determined.
-    """
+    """Closed borders of the surface, as vertices in the direction of the triangles' edges, except borders that touch
+    themselves."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     size = int(edges.max(initial=0)) + 1
     keys = edges[:, 0] * size + edges[:, 1]
@@ -87,7 +85,7 @@ def border_loops(faces: NDArray[np.int32]) -> list[NDArray[np.int32]]:
 def decimated(mesh: Mesh, max_triangles: int) -> Mesh:
     """Mesh with at most ``max_triangles`` triangles, by quadric edge collapse (Garland and Heckbert 1997).
 
-    Vertices take colour and normal of the nearest vertex of the given mesh.
+    Vertices take colour and normal of the nearest given one.
     """
     if len(mesh.faces) <= max_triangles:
         return mesh
@@ -101,7 +99,7 @@ def decimated(mesh: Mesh, max_triangles: int) -> Mesh:
 
 
 def rotated(mesh: Mesh, R: NDArray[np.float64]) -> Mesh:
-    """Mesh in other axes: ``R`` (3, 3) takes the old ones to the new."""
+    """Mesh in the axes to which ``R`` (3, 3) leads."""
     turned = R.T.astype(np.float32)
     return replace(mesh, vertices=mesh.vertices @ turned, normals=mesh.normals @ turned)
 
@@ -113,7 +111,7 @@ def face_areas(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def face_vectors(mesh: Mesh) -> NDArray[np.float64]:
-    """Normal (F, 3) of each triangle whose length is its surface, square metres."""
+    """Normal (F, 3) of each triangle, of the length of its surface, square metres."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     return np.cross(b - a, c - a) / 2
 

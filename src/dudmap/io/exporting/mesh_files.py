@@ -1,7 +1,6 @@
-"""Mesh files: PLY, OBJ, STL, binary glTF 2.0 and USDZ; and point clouds, the vertices of the mesh: PLY, PCD, LAZ, E57.
+"""Mesh files (PLY, OBJ, STL, binary glTF 2.0, USDZ) and point clouds of the vertices (PLY, PCD, LAZ, E57).
 
-GLB, OBJ and USDZ take a texture. glTF is written here for linear vertex colours with an unlit material, which trimesh
-lacks.
+GLB, OBJ and USDZ take a texture. glTF has linear vertex colours and an unlit material, which trimesh lacks.
 """
 
 import json
@@ -35,16 +34,15 @@ MATERIAL: dict[str, Any] = {
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     "extensions": {"KHR_materials_unlit": {}},
 }
-"""Colours already contain the light; a program without the extension shows a matt surface."""
 
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh in the axes of the map, in the format of the file's suffix: PLY, OBJ or STL."""
+    """Write the mesh in map axes: PLY, OBJ or STL by suffix."""
     edited(run.surface, options).save(path)
 
 
 def write_obj(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write OBJ in the axes of the map: with vertex colours, or with a texture, a .mtl and a .jpg file of its name."""
+    """Write OBJ in map axes, with vertex colours, or with a texture, a .mtl and a .jpg of its name."""
     if options.texture is None:
         return write(run, path, options)
     made = _textured(run, options)
@@ -62,7 +60,7 @@ def write_obj(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_glb(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh as binary glTF. Vertices keep the map's axes; the node turns them to y up."""
+    """Write the mesh as binary glTF. Vertices keep map axes; the node turns them to y up."""
     made = None if options.texture is None else _textured(run, options)
     mesh = edited(run.surface, options) if made is None else made.mesh
     T = np.eye(4)
@@ -93,7 +91,7 @@ def encoded(
     """Content of a GLB file (glTF 2.0, sections 3 and 4.4).
 
     Args:
-        texture: Places (V, 2) in an image, from its upper left corner, and the JPEG file; None for vertex colours.
+        texture: Places (V, 2) from the upper left corner, and the JPEG file; None for vertex colours.
     """
     from dudmap.version import __version__
 
@@ -155,7 +153,7 @@ def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 
 def write_usdz(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh as USDZ, y up, metres, with its colours as ``displayColor``, or with a texture."""
+    """Write the mesh as USDZ, y up, metres, with ``displayColor`` or a texture."""
     with extra("export", "writing .usdz"):
         # by name, because type checkers see no classes of usd-core
         sdf, usd, geom, utils, vt = (import_module(f"pxr.{n}") for n in ("Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt"))
@@ -191,7 +189,6 @@ def write_usdz(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def _usd_material(stage: Any, prim: Any, sdf: Any, vt: Any, uv: NDArray[np.float32]) -> None:  # noqa: ANN401 - of USD
-    """Give a mesh the texture map.jpg by a UsdPreviewSurface that emits its colours."""
     geom, shade = import_module("pxr.UsdGeom"), import_module("pxr.UsdShade")
     places = np.column_stack([uv[:, 0], 1 - uv[:, 1]]).astype(np.float32)  # v grows upwards
     st = geom.PrimvarsAPI(prim).CreatePrimvar("st", sdf.ValueTypeNames.TexCoord2fArray, geom.Tokens.vertex)
@@ -217,7 +214,7 @@ def _usd_material(stage: Any, prim: Any, sdf: Any, vt: Any, uv: NDArray[np.float
 
 
 LAS_STEP = 0.0001
-"""Resolution of coordinates in LAS files, metres: a hundredth of a voxel."""
+"""Resolution of LAS coordinates, metres."""
 
 
 def _points(run: RunContent, options: ExportOptions) -> Mesh:
@@ -231,9 +228,7 @@ def write_ply(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_pcd(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write binary PCD 0.7 with the fields x y z rgb normal_x normal_y normal_z; rgb is packed into a float, as PCL
-    expects.
-    """
+    """Write binary PCD 0.7 with x y z rgb normal_x normal_y normal_z; rgb is packed into a float, as PCL expects."""
     points = _points(run, options)
     row = np.dtype([("xyz", "<f4", 3), ("rgb", "<u4"), ("normal", "<f4", 3)])
     rows = np.empty(len(points.vertices), row)

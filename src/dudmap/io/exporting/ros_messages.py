@@ -1,7 +1,7 @@
-"""ROS 2 messages from and to arrays, and MCAP files of them. Message classes come from the caller (rosbags or rclpy).
+"""ROS 2 messages from and to arrays, and MCAP files. The caller passes message classes (rosbags or rclpy).
 
-Frames: ``map`` is the world of the map (REP 105), ``camera`` has x right, y down, z forward (REP 103). Unsupported
-messages raise a ``DatasetError``.
+Frames: ``map`` (REP 105); ``camera``, x right, y down, z forward (REP 103). Unsupported messages raise a
+``DatasetError``.
 """
 
 import tempfile
@@ -25,7 +25,7 @@ from dudmap.io.exporting.run_content import ExportOptions, RunContent
 
 MAP_FRAME, CAMERA_FRAME = "map", "camera"
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-"""A point of a cloud: metres, and colour as 0x00RRGGBB, which RViz and Foxglove read from a field ``rgb``."""
+"""A point of a cloud: metres, and colour as 0x00RRGGBB in a field ``rgb``."""
 FLOAT32 = 7
 """``sensor_msgs/PointField.FLOAT32``, also of the packed colour by convention."""
 TRIANGLE_LIST, CUBE, ADD, DELETE_ALL = 11, 1, 0, 3
@@ -37,8 +37,8 @@ class MessageTypes:
     """Access to message classes.
 
     Attributes:
-        find: Class of a type such as ``nav_msgs/msg/Path``, which takes its fields as keywords.
-        octets: Bytes of an array in the form of a field ``uint8[]``.
+        find: Class of a type such as ``nav_msgs/msg/Path``, with fields as keywords.
+        octets: Bytes of an array as a field ``uint8[]``.
     """
 
     find: Callable[[str], Any]
@@ -108,7 +108,7 @@ def odometry(
     parent: str,
     child: str,
 ) -> Any:  # noqa: ANN401
-    """``nav_msgs/Odometry`` of a pose (4, 4) with its covariance (6, 6), world axes, and of a twist (6,) per second in
+    """``nav_msgs/Odometry`` of a pose (4, 4), its covariance (6, 6) in world axes, and a twist (6,) per second in
     camera axes; covariances of 0 are unknown."""
     twist = types.make(
         "geometry_msgs/msg/Twist", linear=vector(types, velocity[:3]), angular=vector(types, velocity[3:])
@@ -152,7 +152,7 @@ def cloud(types: MessageTypes, seconds: float, points: NDArray, colors: NDArray[
 
 
 def image(types: MessageTypes, seconds: float, pixels: NDArray, encoding: str, frame: str) -> Any:  # noqa: ANN401
-    """``sensor_msgs/Image`` of an array (H, W) or (H, W, 3) in the byte layout of the encoding."""
+    """``sensor_msgs/Image`` of an array (H, W) or (H, W, 3) in the encoding's layout."""
     height, width = pixels.shape[:2]
     return types.make(
         "sensor_msgs/msg/Image",
@@ -174,7 +174,7 @@ def camera_info(types: MessageTypes, seconds: float, camera: Camera, frame: str)
 
 
 def mesh_marker(types: MessageTypes, seconds: float, mesh: Mesh, frame: str) -> Any:  # noqa: ANN401
-    """``visualization_msgs/Marker`` with the triangles of a mesh, coloured by vertex."""
+    """``visualization_msgs/Marker`` with a mesh, coloured by vertex."""
     corners = mesh.faces.reshape(-1)
     find_point, find_color = types.find("geometry_msgs/msg/Point"), types.find("std_msgs/msg/ColorRGBA")
     points = [find_point(x=x, y=y, z=z) for x, y, z in mesh.vertices[corners].astype(float).tolist()]
@@ -184,10 +184,10 @@ def mesh_marker(types: MessageTypes, seconds: float, mesh: Mesh, frame: str) -> 
 
 
 def mover_markers(types: MessageTypes, seconds: float, movers: Sequence[Mapping[str, Any]], frame: str) -> Any:  # noqa: ANN401
-    """``visualization_msgs/MarkerArray`` with the box of every moving object; older boxes are removed.
+    """``visualization_msgs/MarkerArray`` with the boxes of moving objects; older ones are removed.
 
     Args:
-        movers: Objects with ``id`` and ``box`` (lower and upper corner, metres), as in movers.jsonl.
+        movers: Objects with ``id`` and ``box`` (corners, metres), as in movers.jsonl.
     """
     markers = [_marker(types, seconds, frame, "movers", 0, CUBE, action=DELETE_ALL)]
     for mover in movers:
@@ -211,7 +211,6 @@ def _marker(
     alpha: float = 1.0,
     **fields: Any,  # noqa: ANN401
 ) -> Any:  # noqa: ANN401
-    """``visualization_msgs/Marker`` with all its fields."""
     empty = types.octets(np.zeros(0, np.uint8))
     common: dict[str, Any] = {
         "header": header(types, seconds, frame), "ns": namespace, "id": number, "type": kind, "action": ADD,
@@ -237,7 +236,7 @@ def seconds_of(message: Any) -> float:  # noqa: ANN401
 
 
 def camera_of(message: Any) -> Camera:  # noqa: ANN401
-    """Camera of a ``sensor_msgs/CameraInfo``."""
+    """Triangles of the mesh marker."""
     k = [float(value) for value in message.k]
     d = tuple(float(value) for value in message.d)
     if k[0] <= 0 or k[4] <= 0:
@@ -260,11 +259,11 @@ class McapWriter:
     """A new bag of ROS 2 with one MCAP file.
 
     Args:
-        folder: Of the bag; it must not exist.
-        compressed: Whether the file is compressed by zstd.
+        folder: New folder of the bag.
+        compressed: By zstd.
 
     Attributes:
-        file: The MCAP file, complete when the writer is closed.
+        file: The MCAP file, complete when closed.
 
     Raises:
         MissingExtraError: rosbags is not installed.
@@ -291,10 +290,7 @@ class McapWriter:
         self._writer.write(self._connections[topic], nanoseconds, self._store.serialize_cdr(message, kind))
 
     def flush(self) -> int:
-        """Complete and write the current chunk, so that it is readable if the file is never closed.
-
-        Returns the handle of the file.
-        """
+        """Write the current chunk, so that it is readable if the file is never closed; returns the file's handle."""
         storage: Any = self._writer.storage
         if storage.chunk.msgs:
             storage.close_chunk()
@@ -307,10 +303,9 @@ class McapWriter:
 
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write trajectory, surface and movers of a run.
+    """Write trajectory, surface and movers: /tf (map to camera), /odometry, /path, /points, /mesh and /movers.
 
-    Topics: /tf (map to camera), /odometry, /path, /points (vertices of the mesh), /mesh and /movers. Path, points and
-    mesh come at the time of the first pose.
+    Path, points and mesh have the time of the first pose.
     """
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
         with closing(McapWriter(Path(folder) / "run", "writing .mcap", compressed=True)) as writer:
@@ -320,7 +315,6 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def _messages(types: MessageTypes, run: RunContent) -> Iterator[tuple[str, float, Any]]:
-    """Topic, time and message of everything in a run, in order of time."""
     stamps, Ts, frame = run.trajectory.timestamps, run.trajectory.Ts_world_camera, MAP_FRAME
     first = float(stamps[0])
     yield "/path", first, path(types, first, stamps, Ts, frame)

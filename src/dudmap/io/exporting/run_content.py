@@ -1,4 +1,4 @@
-"""Input of exporters: the results in a run folder, and the options of an export.
+"""Input of exporters: results in a run folder, and export options.
 
 Missing, damaged or newer files raise a ``DatasetError``, or a ``MapError`` for mesh and map.
 """
@@ -30,10 +30,7 @@ NEAR = 0.001
 
 @dataclass(frozen=True, eq=False)
 class RunContent:
-    """Results of a run; each file is read on first access.
-
-    Attributes:
-    """
+    """Results of a run, read on first access."""
 
     folder: Path
 
@@ -66,19 +63,19 @@ class RunContent:
 
     @property
     def recording(self) -> dict[str, Any]:
-        """Arguments of ``open_sequence`` for the recording of the run; empty if the run does not name it."""
+        """Arguments of ``open_sequence`` for the recording of the run; empty if unnamed."""
         found = self.metrics.get("recording")
         return found if isinstance(found, dict) else {}
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses at the exposure times of the tracked frames' depth images."""
+        """Poses of the tracked frames at exposure times."""
         taken = self.folder / "image_poses.txt"
         return Trajectory.load(taken if taken.is_file() else self.folder / "trajectory.txt")
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The static surface, None if there is none (a run that only localised)."""
+        """The static surface, None after localisation."""
         path = self.folder / "mesh.ply"
         return Mesh.load(path) if path.is_file() else None
 
@@ -102,7 +99,7 @@ class RunContent:
 
     @cached_property
     def movers(self) -> list[dict[str, Any]]:
-        """Moving objects by frame, as in movers.jsonl; none if there is no file."""
+        """Moving objects by frame, as in movers.jsonl."""
         path = self.folder / "movers.jsonl"
         if not path.is_file():
             return []
@@ -113,16 +110,12 @@ class RunContent:
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Calibration of the colour camera that the run used, None if the folder holds none."""
+        """Colour calibration of the run, or None."""
         path = self.folder / "calibration.toml"
         return Calibration.load(path) if path.is_file() else None
 
     def color_pose(self, timestamp: float) -> NDArray[np.float64]:
-        """Pose (4, 4) of the colour camera for an image with this time stamp.
-
-        Pose and delay of a separate colour camera come from the calibration. Times outside the trajectory take its
-        first or last pose.
-        """
+        """Pose (4, 4) of the colour camera at a time stamp, by the calibration; clamped to the trajectory."""
         calibration, stamps = self.calibration, self.trajectory.timestamps
         delay = 0.0 if calibration is None else calibration.delay
         T = self.trajectory.interpolate(float(np.clip(timestamp + delay, stamps[0], stamps[-1])))
@@ -139,10 +132,10 @@ class RunContent:
         return masks
 
     def frames_of(self, sequence: "Sequence") -> Iterator[tuple[int, NDArray[np.float64], Path]]:
-        """Number, pose (4, 4) and mask of every frame of the recording that has both in the run.
+        """Number, pose (4, 4) and mask of every frame that has both.
 
         Raises:
-            DatasetError: The run has no masks, or none of its poses belongs to the recording.
+            DatasetError: The run has no masks, or no pose of the recording.
         """
         masks, found = self.mask_files(), False
         stamps = np.array(sorted(masks))
@@ -157,10 +150,10 @@ class RunContent:
             )
 
     def color_camera(self, sequence: "Sequence") -> "Camera":
-        """Camera of the recorded colour images: the depth camera if they are registered to it.
+        """Camera of the recorded colour images: the depth camera if registered.
 
         Raises:
-            DatasetError: They are not registered, and the run holds no pose of their camera.
+            DatasetError: They are not registered, and the run lacks their camera's pose.
         """
         if sequence.calibration is None:
             return sequence.camera
@@ -180,28 +173,27 @@ def _numbers(version: str) -> list[int]:
 
 Box = tuple[float, float, float, float, float, float]
 SPECK = 4e-4
-"""Smallest surface of a connected piece that is exported by default, square metres: 2 cm wide; smaller pieces are
-noise."""
+"""Smallest exported connected piece, square metres: 2 cm wide; smaller ones are noise."""
 MESH_OPTIONS = ("max_triangles", "crop", "drop_pieces_below", "fill_holes")
 
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Options of an export; each format takes some of them.
+    """Options of an export.
 
     Attributes:
-        max_triangles: Largest number of triangles.
-        crop: Lower and upper corner of the part of the map to keep, metres, world frame.
-        drop_pieces_below: Connected pieces of the mesh with a smaller surface are omitted, square metres.
-        fill_holes: Longest border of holes that are closed, metres.
-        up: Direction against gravity in the world frame; None for the measured one, else the normal of the floor.
-        z_up: Whether surface and trajectory are written with z up from the floor and x along the first view.
+        max_triangles: Limit.
+        crop: Corners of the kept part of the map, metres, world frame.
+        drop_pieces_below: Surface of omitted connected pieces, square metres.
+        fill_holes: Longest border of closed holes, metres.
+        up: Direction against gravity, world frame; None for the measured one, else the floor's normal.
+        z_up: Whether surface and trajectory have z up from the floor, x along the first view.
         resolution: Edge of the cells of grids, metres.
-        heights: Lower and upper end of the robot above the floor, metres.
-        sequence: Recording of the run; None for the recording that the run names.
-        camera: Intrinsics of that recording, as for ``--camera``; None for the run's intrinsics.
-        every: Every N-th frame of the recording is exported.
-        texture: Width and height of the texture of a mesh, pixels; None for vertex colours.
+        heights: Of the robot's lower and upper end above the floor, metres.
+        sequence: Recording; None for the run's.
+        camera: Its intrinsics, as for ``--camera``; None for the run's.
+        every: Exports every N-th frame.
+        texture: Width and height, pixels; None for vertex colours.
     """
 
     max_triangles: int | None = None
@@ -218,10 +210,10 @@ class ExportOptions:
     texture: int | None = None
 
     def check(self, taken: tuple[str, ...], name: str) -> None:
-        """Check that only options are set that a format takes.
+        """Check that a format takes all set options.
 
         Raises:
-            ConfigError: Another one is set.
+            ConfigError: It does not.
         """
         for field in fields(self):
             if getattr(self, field.name) != field.default and field.name not in taken:

@@ -1,4 +1,4 @@
-"""The upward direction in the world of a run: given, measured by the recording, or guessed from the floor."""
+"""The upward direction in the world of a run: given, measured, or guessed from the floor."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -16,17 +16,16 @@ from dudmap.io.exporting.run_content import ExportOptions, RunContent
 from dudmap.io.sequences.gravity import MeasuredUp, mean_direction
 
 CONTRADICTS = 20.0
-"""Angle beyond which two directions against gravity contradict each other, degrees: more than ramps and drift, less
-than stairs."""
+"""Angle beyond which two up directions contradict each other, degrees: between ramps and stairs."""
 ACCURACY = 5.0
-"""A floor within this angle of measured gravity is level, degrees: the error of IMU mounting and map drift."""
+"""A floor within this angle of measured gravity is level, degrees: IMU mounting and map drift."""
 LEVEL = np.cos(np.radians(15))
-"""A surface faces a direction if its normal is within 15 degrees (cosine)."""
+"""A surface faces a direction within 15 degrees (cosine)."""
 UPSIDE_DOWN = 2.0
-"""Ratio of surface facing down to up from which the map may be upside down: cameras look down on furniture."""
+"""Ratio of surface facing down to up of a map that may be upside down."""
 TURNED, STEADY = 0.64, 0.9
-"""Singular values of the mean rotation matrix. The second is below ``TURNED`` (sin(x) / x at a quarter turn) if the
-cameras turn by half a turn. The first is above ``STEADY`` if they nod by less than 25 degrees."""
+"""Singular values of the mean rotation: the second is below ``TURNED`` (sin(x) / x at a quarter turn) after half a
+turn, the first above ``STEADY`` when nodding by less than 25 degrees."""
 ASSUMED = "assumed: the camera is upright"
 
 
@@ -35,8 +34,8 @@ class Up(NamedTuple):
 
     Attributes:
         direction: (3,) unit vector.
-        source: ``given``, ``gravity`` (measured by the recording), ``floor`` (the level surface below an upright
-            camera) or ``cameras`` (the mean upper edge of the images).
+        source: ``given``, ``gravity`` (measured), ``floor`` (level surface below an upright camera) or ``cameras``
+            (mean upper edge of the images).
         sigma_deg: Standard deviation, degrees; None for a given direction.
         evidence: Words for the source.
         contradiction: Sentence against it; empty without one.
@@ -67,12 +66,12 @@ def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
 
 
 def find_floor(run: RunContent, options: ExportOptions) -> Floor:
-    """The floor of a map; a ``ConfigError`` if there is none, or if it may be the ceiling."""
+    """The floor of a map; ``ConfigError`` if there is none, or it may be the ceiling."""
     return checked_floor(run, run_up(run, options))
 
 
 def checked_floor(run: RunContent, up: Up) -> Floor:
-    """The floor of a map below a direction; a ``ConfigError`` if the direction is a contradicted guess."""
+    """The floor below a direction; ``ConfigError`` if the direction is a contradicted guess."""
     if up.contradiction and up.source not in ("given", "gravity"):
         raise ConfigError(up.contradiction)
     if up.floor is None:
@@ -81,7 +80,7 @@ def checked_floor(run: RunContent, up: Up) -> Floor:
 
 
 def upright(run: RunContent, options: ExportOptions) -> tuple[RunContent, ExportOptions]:
-    """Surface and trajectory of a run in axes with z up from the floor, and the options that are left to apply."""
+    """Surface and trajectory with z up from the floor, and the remaining options."""
     T = z_up(find_floor(run, options))
     mesh = rotated(edited(run.surface, options), T[:3, :3])
     mesh = replace(mesh, vertices=(mesh.vertices + T[:3, 3]).astype(np.float32))
@@ -92,12 +91,12 @@ def upright(run: RunContent, options: ExportOptions) -> tuple[RunContent, Export
 
 
 def run_up(run: RunContent, options: ExportOptions) -> Up:
-    """The direction against gravity in the world of a finished run."""
+    """The direction against gravity of a finished run."""
     return find_up(run.surface, run.trajectory, measured_in(run), options.up)
 
 
 def measured_in(run: RunContent) -> MeasuredUp | None:
-    """Direction against gravity that the recording measured, from metrics.json; None without one."""
+    """Measured direction against gravity, from metrics.json; None without one."""
     found = (run.metrics.get("up") or {}).get("gravity")
     if found is None:
         return None
@@ -110,10 +109,10 @@ def find_up(
     measured: MeasuredUp | None = None,
     given: tuple[float, float, float] | None = None,
 ) -> Up:
-    """The direction against gravity, by the best evidence there is.
+    """The direction against gravity, by the best evidence.
 
     Args:
-        mesh: The surface, if there is one.
+        mesh: The surface, if any.
         poses: Of the cameras, in the world of the mesh.
 
     Raises:
@@ -171,7 +170,6 @@ def _floor(mesh: Mesh, near: NDArray[np.float64], limit: float | None = None) ->
 
 
 def _unevenness(mesh: Mesh, floor: Floor) -> float:
-    """Angle, degrees, between the deviation of the floor from its plane and its shorter extent."""
     facing = (mesh.normals @ floor.up > LEVEL) & (np.abs(mesh.vertices @ floor.up - floor.height) < 0.05)
     points = mesh.vertices[facing].astype(np.float64)
     if len(points) < 10:

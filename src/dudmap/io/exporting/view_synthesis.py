@@ -1,4 +1,4 @@
-"""Posed images with masks, for view synthesis: folders of nerfstudio and of COLMAP."""
+"""Posed images with masks for nerfstudio and COLMAP."""
 
 import json
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 PIXEL = 0.5
-"""Offset between pixel conventions: these programs begin at the corner of the first pixel, dudmap at its centre."""
+"""Pixel convention of these programs: the corner of the first pixel is 0."""
 
 
 class View(NamedTuple):
@@ -34,7 +34,7 @@ class View(NamedTuple):
 
     Attributes:
         color: (h, w, 3) uint8, as recorded.
-        moving: (h, w) bool, dynamic pixels of the colour image.
+        moving: (h, w) bool, dynamic pixels.
         T_world_color: (4, 4) pose of the colour image.
     """
 
@@ -46,10 +46,8 @@ class View(NamedTuple):
 
 
 def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``transforms.json``, images/, depth/ (16 bit, millimetres), masks/ (0 = dynamic, ignored) and points.ply.
-
-    Poses are camera to world with OpenGL's camera axes; points.ply holds the seed points.
-    """
+    """Write ``transforms.json``, images/, depth/ (16 bit, millimetres), masks/ (0 = dynamic) and points.ply (seed
+    points); poses are camera to world with OpenGL axes."""
     sequence = images_of(run, options)
     _seeds(run, options).save(path.parent / "points.ply")
     folders = _folders(path.parent, "images", "depth", "masks")
@@ -77,10 +75,8 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
 
 
 def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``cameras.txt``, ``images.txt``, ``points3D.txt`` (points without tracks), images/ and masks/.
-
-    Masks are named ``NAME.png.png``, 0 = dynamic, as for COLMAP's ``ImageReader.mask_path``.
-    """
+    """Write ``cameras.txt``, ``images.txt``, ``points3D.txt`` (without tracks), images/ and masks/ (``NAME.png.png``, 0
+    = dynamic, for ``ImageReader.mask_path``)."""
     sequence, seeds = images_of(run, options), _seeds(run, options)
     images, masks = _folders(path.parent, "images", "masks")
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
@@ -108,7 +104,6 @@ def _folders(parent: Path, *names: str) -> list[Path]:
 
 
 def _colmap_camera(camera: Camera) -> str:
-    """Model, size and parameters: PINHOLE fx fy cx cy, OPENCV with k1 k2 p1 p2, FULL_OPENCV with k3 to k6."""
     numbers = [camera.fx, camera.fy, camera.cx + PIXEL, camera.cy + PIXEL, *camera.distortion]
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV"}[len(camera.distortion)]
     numbers += [0.0] * 3 if model == "FULL_OPENCV" else []
@@ -116,7 +111,7 @@ def _colmap_camera(camera: Camera) -> str:
 
 
 def images_of(run: RunContent, options: ExportOptions) -> "Sequence":
-    """The recording of a run: as given, else the images kept in the run folder, else the one that the run names.
+    """The recording of a run: given, kept in the run folder, or named by the run.
 
     Raises:
         NoImagesError: There are no images, or no masks.

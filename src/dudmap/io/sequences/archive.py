@@ -1,4 +1,4 @@
-"""Unpack recordings in archives once into a cache; members that no image sequence needs raise an error."""
+"""Unpack archived recordings once into a cache; other members raise an error."""
 
 import bz2
 import errno
@@ -22,13 +22,13 @@ from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged,
 
 SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 LARGEST_BYTES = 256 * 2**30
-"""Largest unpacked size. The largest known recording (a CoRBS scene) has less than 30 GB."""
+"""Largest unpacked size; a CoRBS scene has 30 GB."""
 LARGEST_COUNT = 1_000_000
-"""Largest number of members: 4.6 hours of colour and depth files at 30 Hz."""
+"""Members: 4.6 hours of files at 30 Hz."""
 LARGEST_HEADER = 2**20
-"""Largest header of a tar member, bytes: a long name and its times have 10 kB."""
+"""Header of a tar member, bytes: a long name has 10 kB."""
 LARGEST_DICTIONARY = 2**27
-"""Largest memory for unpacking xz, bytes; the preset 9 needs 65 MB."""
+"""Memory for unpacking xz, bytes; preset 9 needs 65 MB."""
 CHUNK = 2**20
 NAME_FOLDER = "name a folder that you can write in the environment variable DUDMAP_CACHE"
 ORIGIN = "origin.txt"
@@ -51,7 +51,7 @@ def split(path: Path) -> tuple[Path, PurePosixPath] | None:
 
 
 def cache_folder() -> Path:
-    """Folder of unpacked archives: DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap.
+    """DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap.
 
     Raises:
         DatasetError: The user has no home folder.
@@ -66,11 +66,11 @@ def cache_folder() -> Path:
 
 
 def unpack(path: Path) -> Path:
-    """Folder with the content of an archive; unpacked at the first opening and after changes.
+    """Folder with the content of an archive, unpacked once per version.
 
     Raises:
-        DatasetError: The archive is damaged, encrypted or too large, holds links, devices or paths that lead out of it,
-            or the cache cannot be written.
+        DatasetError: The archive is damaged, encrypted or too large, holds links, devices or paths out of it, or the
+            cache cannot be written.
     """
     with damaged(DatasetError, f"the archive {path}"):
         open_plain(path).close()
@@ -118,7 +118,7 @@ def stem(path: Path) -> str:
 
 
 def _unpack_into(path: Path, folder: Path, packed: int) -> None:
-    """Write all files of an archive into a new folder; limit the unpacked bytes."""
+    """Write all files of an archive into a new folder, limited in size."""
     folder.mkdir(parents=True)
     limit = min(LARGEST_BYTES, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed), shutil.disk_usage(folder).free)
     written = 0
@@ -148,7 +148,6 @@ def _unpack_into(path: Path, folder: Path, packed: int) -> None:
 
 
 def _inside(path: Path, member: str, kind: str) -> PurePosixPath:
-    """Relative path of a plain file or folder that does not lead out of the archive."""
     if kind not in ("file", "folder"):
         raise DatasetError(f"{path} holds {member}, a {kind}; an archive of a recording has files only")
     name = member.replace("\\", "/")
@@ -178,7 +177,6 @@ def _tar_members(path: Path) -> "Generator[Member]":
 
 
 def _unpacked(file: IO[bytes]) -> "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile":
-    """Open a file that may be compressed."""
     start = file.read(6)
     file.seek(0)
     if start.startswith(b"\x1f\x8b"):
@@ -200,7 +198,6 @@ class _Bounded:
         self._content, self.left = content, LARGEST_HEADER
 
     def read(self, size: int) -> bytes:
-        """At most ``size`` bytes, which the library keeps until a header is complete."""
         data = self._content.read(size)
         self.left -= len(data)
         if self.left < 0:

@@ -1,4 +1,4 @@
-"""Recordings of Azure Kinect and Femto cameras: Matroska videos of the programs ``k4arecorder`` and ``k4aviewer``."""
+"""Matroska recordings of Azure Kinect and Femto cameras (``k4arecorder``, ``k4aviewer``)."""
 
 from collections.abc import Generator
 from dataclasses import replace
@@ -21,12 +21,12 @@ from dudmap.io.sequences.bag_file import MessageStream
 from dudmap.io.sequences.intrinsics import RATIONAL, Lens
 
 BEFORE = 1_000_000_000
-"""Seeks begin this much earlier, nanoseconds, because they may be inexact."""
+"""Seeks begin this much earlier, nanoseconds."""
 DEPTH_MODES = {
     (320, 288): (512, 96, 90), (640, 576): (1024, 192, 180), (512, 512): (512, 0, 0), (1024, 1024): (1024, 0, 0),
 }  # fmt: skip
-"""Size of depth images to size of the sensor image, which the calibration refers to, and offset of the crop (Azure
-Kinect Sensor SDK, src/transformation/mode_specific_calibration.c)."""
+"""By size of depth images: size of the sensor image of the calibration, and offset of the crop (Azure Kinect Sensor
+SDK, src/transformation/mode_specific_calibration.c)."""
 RAW_COLORS = {"nv12": "COLOR_YUV2RGB_NV12", "yuyv422": "COLOR_YUV2RGB_YUY2", "bgra": "COLOR_BGRA2RGB"}
 
 
@@ -39,11 +39,10 @@ class _Track(NamedTuple):
 
 
 class AzureKinectRecording(Recording):
-    """Recording in a ``.mkv`` file with the tracks COLOR and DEPTH and the attachment calibration.json.
+    """``.mkv`` file with tracks COLOR and DEPTH and the attachment calibration.json.
 
-    Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres
-    and seen from its own camera. Frames are freed of both lenses. Opening reads the whole file, because times stand
-    between the images.
+    Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres,
+    of its own camera; lenses are corrected. Opening reads the whole file.
     """
 
     format = "Azure Kinect .mkv"
@@ -148,7 +147,6 @@ def _nanoseconds(packet: Any) -> int:  # noqa: ANN401
 
 
 def _lens(tree: dict[str, Any], size: tuple[int, int], whole: tuple[float, float], cut: tuple[float, float]) -> Lens:
-    """Lens of calibration.json, in shares of the sensor image ``whole``; images of ``size`` begin at ``cut``."""
     model = tree["Intrinsics"]["ModelType"]
     if model != "CALIBRATION_LensDistortionModelBrownConrady":
         raise DatasetError(

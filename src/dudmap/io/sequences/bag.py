@@ -1,8 +1,5 @@
-"""ROS 1 bags, ROS 2 bags (folders, SQLite and MCAP files), and RealSense recordings, through the package rosbags.
-
-RealSense recordings are ROS bags with special topics: ``.db3`` files of librealsense since March 2026, ``.bag`` files
-before. rosbags reads them without the driver and with random access.
-"""
+"""ROS 1 bags, ROS 2 bags (folders, SQLite and MCAP files), and RealSense recordings (``.db3`` since March 2026,
+``.bag`` before), through rosbags."""
 
 import re
 import weakref
@@ -37,24 +34,22 @@ MAGIC = {".bag": b"#ROSBAG V2.0", ".active": b"#ROSBAG V2.0", ".db3": b"SQLite f
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
 FIRST_TRANSFORMS = 300
-"""Number of first /tf messages that list the frames: seconds at 100 Hz."""
+"""First /tf messages that list the frames."""
 
 
 class RosBag(Recording):
-    """Recording in a ROS bag, opened through its index: images and poses are read when they are used.
+    """Recording in a ROS bag; images and poses are read when used.
 
-    * Times are stamps of the depth messages. In compressed bags they are times of recording minus the median delay of
-      the first messages; if stamps do not increase, times of recording.
-    * Colour is associated one to one, nearest first, at most 20 ms apart. Of messages with the same time one is
-      skipped.
-    * Intrinsics come from camera_info. Depth and colour are registered if their frame of reference and intrinsics are
-      equal. Otherwise ``calibration`` holds the colour camera and its motion to depth from /tf_static. Lenses with more
-      than five coefficients (rational, fisheye) are rectified when an image is read.
-    * The ground truth is the trajectory of the depth camera in the frame ``world`` of /tf.
+    * Times are stamps of the depth messages; in compressed bags, recording times minus the median delay; if stamps do
+      not increase, recording times.
+    * Colour pairs one to one, nearest first, at most 20 ms apart; duplicates in time are skipped.
+    * Intrinsics come from camera_info. Depth and colour are registered if frame of reference and intrinsics are equal;
+      else ``calibration`` has the colour camera, its motion from /tf_static. Rational and fisheye lenses are rectified.
+    * The ground truth is the depth camera's trajectory in the frame ``world`` of /tf.
 
     Args:
-        path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
-        camera: Intrinsics of the depth images, which replace the bag's intrinsics.
+        path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag.
+        camera: Intrinsics that replace the bag's.
         topics: ``color=/a,depth=/b,color_info=/c,depth_info=/d,world=map``, each optional.
     """
 
@@ -88,7 +83,7 @@ class RosBag(Recording):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a file starts like a bag, or a folder holds the metadata.yaml of a ROS 2 bag."""
+        """Whether a file starts like a bag, or a folder holds metadata.yaml."""
         if path.is_dir():
             return (path / "metadata.yaml").is_file()
         magic = MAGIC.get(path.suffix.lower())
@@ -125,13 +120,13 @@ class RosBag(Recording):
 
     @cached_property
     def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """True poses of the depth camera, None without a world frame; read at the first use."""
+        """True poses of the depth camera, None without a world frame."""
         with foreign(DatasetError, f"the poses in /tf of {self.path}"):
             return self._true_poses()
 
     @cached_property
     def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Gravity measured by the IMU, None without one; read at the first use."""
+        """Gravity measured by the IMU, or None."""
         with foreign(DatasetError, f"the accelerations in {self.path}"):
             return gravity_of(self._bag, self._rotation_of)
 
@@ -234,7 +229,6 @@ class RosBag(Recording):
         return MILLIMETRES
 
     def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
-        """Lens of a camera_info; a rectified one comes from the projection matrix."""
         info = self._bag.first(connection)
         if info is None:
             return None
@@ -261,7 +255,6 @@ class RosBag(Recording):
         return self._tree(FIRST_TRANSFORMS)
 
     def _tree(self, count: int | None) -> TransformTree:
-        """Frames of /tf_static and of the first ``count`` messages of /tf, None for all."""
         tree = TransformTree()
         for topic, limit in ((TOPIC, count), (STATIC_TOPIC, FIRST_TRANSFORMS)):
             found = [c for c in self._bag.connections if c.topic == topic and c.msgcount]
@@ -283,10 +276,9 @@ HEAD = 1 << 18
 
 
 class RealSenseRecording(RosBag):
-    """Recording of a RealSense camera; depth is registered by the factory calibration in the file.
+    """RealSense recording; depth is registered by the factory calibration in the file.
 
-    Frame times come from the metadata of every frame (``.db3``) or from the headers (``.bag``). The depth unit is the
-    camera's option of that name.
+    Frame times come from metadata (``.db3``) or headers (``.bag``), the depth unit from the camera's option.
     """
 
     format = "RealSense recording"
@@ -316,7 +308,6 @@ class RealSenseRecording(RosBag):
         return MessageTimes(recorded, np.array([stamps[int(time)] for time in recorded]), True)
 
     def _rotation_of(self, imu: str) -> NDArray[np.float64] | None:
-        """Identity: accelerations are in the axes of the depth camera."""
         return np.eye(3)
 
     def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
@@ -344,7 +335,6 @@ class RealSenseRecording(RosBag):
         return None if found is None else _motion(self._bag.first(found))
 
     def _beside(self, image: "Connection", name: str, msgtype: str) -> "Connection | None":
-        """First topic of the same stream whose name continues with ``name``."""
         stream = re.match(r"/device_\d+/sensor_\d+/\w+", image.topic)
         prefix = f"{stream[0] if stream else image.topic}/{name}"
         for connection in self._bag.connections:

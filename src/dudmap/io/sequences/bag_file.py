@@ -1,7 +1,7 @@
-"""Read a bag with the package rosbags: topics, message times from the index, and single messages.
+"""Read a bag with rosbags: topics, message times, and single messages.
 
-rosbags trusts its input. This module limits decompression, accepts SQLite files with plain tables only, and decodes
-messages by the published ROS definitions. rosbags itself would turn definitions in a bag into Python code.
+rosbags trusts its input. This module limits decompression, accepts plain SQLite tables only, and decodes by the
+published ROS definitions, which rosbags would otherwise turn into Python code.
 """
 
 import os
@@ -28,27 +28,27 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 LARGEST_METADATA = 2**19
-"""Largest metadata.yaml, bytes. With 100 topics it has 60 kB; parsing takes 20 seconds per megabyte."""
+"""Bytes of metadata.yaml: 60 kB with 100 topics; parsing takes 20 seconds per megabyte."""
 SAMPLES = 30
 CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
-"""Encapsulation, seconds and nanoseconds at the start of a ROS 2 message, by byte order."""
+"""Encapsulation, seconds and nanoseconds of a ROS 2 message, by byte order."""
 ROS1_STAMP = struct.Struct("<4xII")
-"""Sequence number, seconds and nanoseconds at the start of a ROS 1 message."""
+"""Sequence number, seconds and nanoseconds of a ROS 1 message."""
 HEAD = 12
 MCAP_RECORD, MCAP_INDEX, MCAP_MESSAGE, MCAP_CHUNK = 9, 6, 31, 49
-"""Bytes before four kinds of MCAP content: of a record, of the entries in a message index, of a message, of an
-uncompressed chunk (MCAP specification, sections Records, Message and Chunk)."""
+"""Bytes before MCAP content: record, index entries, message, uncompressed chunk (MCAP specification, sections Records,
+Message and Chunk)."""
 TF = "tf2_msgs/msg/TFMessage"
 OLD_TF = "tf/msg/tfMessage"
 
 
 class MessageTimes(NamedTuple):
-    """Times of the messages of a topic, in the order of recording.
+    """Times of the messages of a topic, as recorded.
 
     Attributes:
-        recorded: (N,) int64 strictly increasing times of recording, nanoseconds; they identify a message.
-        stamps: (N,) float64 times in the headers of the messages, seconds.
-        exact: Whether ``stamps`` come from the headers; else they are recording times minus a median delay.
+        recorded: (N,) int64 strictly increasing recording times, nanoseconds; they identify a message.
+        stamps: (N,) float64 header times, seconds.
+        exact: Whether ``stamps`` are from headers; else recording times minus a median delay.
     """
 
     recorded: NDArray[np.int64]
@@ -60,11 +60,11 @@ class BagFile:
     """An open bag.
 
     Args:
-        path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
+        path: As of ``RosBag``.
 
     Attributes:
-        connections: Topics, each with its type and number of messages.
-        unclosed: Whether the file was not closed, so that its end may be missing.
+        connections: Topics with type and count.
+        unclosed: Whether the end may be missing.
 
     Raises:
         MissingExtraError: The package rosbags is missing.
@@ -97,7 +97,7 @@ class BagFile:
         self._reader.close()
 
     def messages(self, connections: "list[Connection]", count: int | None = None) -> Generator[tuple[int, Any]]:
-        """Times of recording and content of the first ``count`` messages of some topics, None for all."""
+        """Recording times and content of the first ``count`` messages of some topics, None for all."""
         with self._stream.lock, closing(self._reader.messages(connections)) as found:
             self._stream.close()  # without chunks, two passes would move one place in the file
             for connection, time, raw in islice(found, count):
@@ -110,11 +110,8 @@ class BagFile:
         return None
 
     def times(self, connection: "Connection") -> MessageTimes:
-        """Times of the messages of a topic whose type has a header, without reading its images.
-
-        They come from the index, and stamps from the first bytes of each message. Stamps of compressed bags are
-        estimated. Only an MCAP file without chunks is read through once.
-        """
+        """Times of the messages of a topic with headers, from the index and first bytes; stamps of compressed bags are
+        estimated."""
         rows = list(self._ros1_entries(connection) if self._ros1 else self._ros2_entries(connection))
         recorded, first = np.unique(np.array([time for time, _ in rows], dtype=np.int64), return_index=True)
         heads = [head for _, head in rows if head is not None]
@@ -125,7 +122,7 @@ class BagFile:
         return MessageTimes(recorded, 1e-9 * recorded - np.median(delays), False)
 
     def read(self, wanted: "list[tuple[Connection, int]]") -> list[Any]:
-        """Messages of these topics, which are the same in every call, at these times of recording.
+        """Messages at these recording times, of the same topics in every call.
 
         Raises:
             KeyError: There is no such message.
@@ -196,7 +193,6 @@ def _mcap_entries(part: Any, connection: "Connection") -> Iterable[tuple[int, by
 
 
 def _opened(make: Callable[[Any], Any], path: Path) -> tuple[Any, bool]:
-    """An open reader of rosbags, and whether the file was unclosed and has a new index."""
     reader = make(path)
     try:
         reader.open()
@@ -218,7 +214,7 @@ def _open(path: Any) -> IO[bytes]:  # noqa: ANN401 - a path, or a file that stan
 
 
 def _check(path: Path) -> None:
-    """Accept plain files and plain SQLite tables only: a view would be a program that runs when the bag is read."""
+    """Accept plain files and SQLite tables only: a view would be a program."""
     if path.is_dir():
         read_text(path / "metadata.yaml", LARGEST_METADATA)
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
@@ -252,8 +248,7 @@ def limit_rosbags() -> None:
 
 @contextmanager
 def without_definitions() -> Generator[None]:
-    """Make rosbags ignore message definitions in MCAP files during the block: it would refuse one in an unknown
-    language."""
+    """Make rosbags ignore message definitions in MCAP files."""
     from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
     from rosbags.rosbag2 import storage_mcap
 
@@ -266,7 +261,7 @@ def without_definitions() -> Generator[None]:
 
 
 def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    """Limit a decompressor with the interface of the standard library to ``LARGEST_CHUNK`` bytes."""
+    """Limit a decompressor to ``LARGEST_CHUNK`` bytes."""
 
     def decompress(data: bytes) -> bytes:
         out = make().decompress(bytes(data), LARGEST_CHUNK + 1)
@@ -278,7 +273,7 @@ def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
 
 
 class _BoundedZstd:
-    """Replaces the module zstd in readers of bags with compressed messages or files."""
+    """Replaces zstd in rosbags, limited in size."""
 
     def __init__(self, zstd: Any, decompress: Callable[[bytes], bytes]) -> None:  # noqa: ANN401
         self._zstd, self.decompress = zstd, decompress
@@ -291,7 +286,7 @@ class _BoundedZstd:
 
 
 class _BoundedFile:
-    """A file that is unpacked while it is read, up to a number of bytes."""
+    """A file unpacked while read, limited in size."""
 
     def __init__(self, file: IO[bytes], left: int) -> None:
         self._file, self._left = file, left
@@ -305,20 +300,20 @@ class _BoundedFile:
 
 
 JUMP = 2_000_000_000
-"""Distance, nanoseconds, from which a new stream costs less than streaming."""
+"""Distance, nanoseconds, from which a new stream is cheaper."""
 
 
 class MessageStream:
-    """Access to messages by topic and time of recording in nanoseconds.
+    """Access to messages by topic and recording time in nanoseconds.
 
-    Requests in order are served by one pass over the file, which keeps messages of other topics until it is beyond
-    them. A jump opens a new pass at the wanted time.
+    One pass serves requests in order and keeps messages of other topics until it is beyond them; a jump opens a new
+    pass.
 
     Args:
-        start: Opens a pass over the messages of some topics from a given time: topic, time and content of each.
+        start: Opens a pass over topics from a time: topic, time and content of each.
 
     Attributes:
-        lock: Held while the file is read, possibly in another thread.
+        lock: Held while the file is read.
     """
 
     def __init__(self, start: Callable[[list[str], int], Generator[tuple[str, int, bytes]]]) -> None:
@@ -329,7 +324,7 @@ class MessageStream:
         self._position = -1
 
     def read(self, wanted: list[tuple[str, int]]) -> list[bytes]:
-        """Messages of the same topics as in every call, at these times.
+        """Messages at these times, of the same topics in every call.
 
         Raises:
             KeyError: There is no such message.

@@ -1,4 +1,4 @@
-"""Gravity from the accelerations in a bag: an IMU at rest measures the direction against gravity."""
+"""Gravity from the accelerations in a bag of an IMU at rest."""
 
 import re
 from typing import TYPE_CHECKING, Any
@@ -17,24 +17,23 @@ if TYPE_CHECKING:
 
 IMU = "sensor_msgs/msg/Imu"
 FIRST = 4000
-"""First messages of a topic that are read: 10 s at 400 Hz, the highest usual rate."""
+"""First messages that are read: 10 s at 400 Hz."""
 STANDARD = 9.80665
 """Standard acceleration of gravity, m/s^2 (ISO 80000-3)."""
 SCALE = 0.1
-"""Largest relative deviation of the median acceleration from gravity: more than an IMU's scale error, less than a
-wrong unit gives."""
+"""Largest relative deviation of the median from gravity: more than a scale error, less than a wrong unit."""
 STILL = 0.02
-"""Largest relative deviation of an acceleration from the median of a steady IMU."""
+"""Largest relative deviation of a steady IMU."""
 
 
 def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64] | None]") -> Gravity | None:
     """Gravity measured by the first usable IMU of a bag; None without an IMU.
 
     Args:
-        rotation_of: Rotation (3, 3) of vectors in a named frame into the depth camera, None if it is unknown.
+        rotation_of: Rotation (3, 3) from a named frame to the depth camera, or None.
 
     Raises:
-        DatasetError: There are IMUs, but none can be used; the message says why.
+        DatasetError: No IMU can be used; the message says why.
     """
     problems = []
     for connection in bag.connections:
@@ -63,7 +62,7 @@ def gravity_of(bag: "BagFile", rotation_of: "Callable[[str], NDArray[np.float64]
 
 
 def is_realsense_optical(imu: str, depth: str) -> bool:
-    """Whether two frames belong to one RealSense camera, whose accelerations are in the axes of its depth camera."""
+    """Whether both are frames of one RealSense camera."""
     found = re.fullmatch(r"/?(.*)(?:imu|accel|gyro)_optical_frame", imu)
     return found is not None and depth.lstrip("/").startswith(found[1]) and depth.endswith("_optical_frame")
 

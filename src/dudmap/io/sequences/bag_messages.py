@@ -1,6 +1,6 @@
-"""Interpret the messages of a bag: topics by type and name, the frame tree of /tf, and images.
+"""Interpret the messages of a bag: topics, the frame tree of /tf, images.
 
-Missing or ambiguous topics raise a ``DatasetError``; unknown encodings and damaged data a ``FrameError``.
+Missing or ambiguous topics raise a ``DatasetError``; other encodings and damage a ``FrameError``.
 """
 
 import re
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 INFO = "sensor_msgs/msg/CameraInfo"
 KEYS = ("color", "depth", "color_info", "depth_info", "world")
-"""Keys of ``--topics``: topics of the images and of their camera_info, and the world frame of /tf."""
+"""Keys of ``--topics``."""
 TRANSPORTS = ("compressed", "compressedDepth")
-"""Last parts of the topics that image_transport adds for its encodings."""
+"""Last parts of image_transport's topics."""
 DEPTH_NAME = re.compile(r"depth")
 COLOR_NAME = re.compile(r"rgb|colou?r|image|video|left")
 OTHER_NAME = re.compile(r"infra|(^|[/_])ir([/_\d]|$)|confidence|disparity|right|gray|mono|theora|mask|label|points")
@@ -32,8 +32,7 @@ REGISTERED_NAME = re.compile(r"aligned|depth_registered|depth_to_(rgb|color)|hw_
 
 
 class Topics(NamedTuple):
-    """Connections of both images and of their camera_info, and the world frame; without colour both images are
-    depth."""
+    """Connections of images and camera_info, and the world frame; without colour both images are depth."""
 
     color: "Connection"
     depth: "Connection"
@@ -43,7 +42,7 @@ class Topics(NamedTuple):
 
     @property
     def registered(self) -> bool:
-        """Whether the name of the depth topic indicates registration to colour."""
+        """Whether the depth topic's name says registered."""
         return bool(REGISTERED_NAME.search(self.depth.topic))
 
 
@@ -65,7 +64,7 @@ def chosen_topics(text: str | None) -> dict[str, str]:
 def find_topics(
     connections: "Sequence[Connection]", chosen: dict[str, str], bag: str, first: "Callable[[Connection], Any]"
 ) -> Topics:
-    """Chosen topics, else recognised by names, else by encodings; ``first`` gives the first message of a topic."""
+    """Chosen topics, else by names, else by encodings; ``first`` gives the first message of a topic."""
     filled = [connection for connection in connections if connection.msgcount > 0]
     images = [connection for connection in filled if connection.msgtype in IMAGES]
     depths = [_named(images, chosen["depth"], bag)] if "depth" in chosen else [c for c in images if _is_depth(c)]
@@ -106,8 +105,6 @@ def base(topic: str) -> str:
 def _best(
     pairs: "list[tuple[Connection, Connection]]", images: "Sequence[Connection]", bag: str
 ) -> "tuple[Connection, Connection]":
-    """Pair of one camera: registered before unregistered, rectified before raw, raw data before compressed."""
-
     def score(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
         color, depth = pair
         left, right = base(color.topic).split("/"), base(depth.topic).split("/")
@@ -134,7 +131,7 @@ def _best(
 
 
 def _info_of(image: "Connection", infos: "Sequence[Connection]") -> "Connection | None":
-    """The camera_info of an image, as placed by image_transport, or in ``info`` (old RealSense files)."""
+    """The camera_info of an image, as by image_transport, or in ``info``."""
     parent = base(image.topic).rpartition("/")[0]
     names = (f"{parent}/camera_info", f"{parent.removesuffix('/image')}/info/camera_info")
     return next((info for name in names for info in infos if info.topic == name), None)
@@ -151,7 +148,6 @@ def _is_color(connection: "Connection") -> bool:
 
 
 def _kind(image: Any) -> str:  # noqa: ANN401 - the type is made from the bag
-    """ "depth" or "colour" by the encoding of an Image or CompressedImage; empty if it may be either."""
     if hasattr(image, "format"):
         form = image.format.lower()
         return "depth" if "compresseddepth" in form else "colour" if re.match(r"(rgb|bgr)a?8|jpe?g", form) else ""
@@ -174,21 +170,18 @@ def _listed(connections: "Iterable[Connection]") -> str:
 
 STATIC_TOPIC, TOPIC = "/tf_static", "/tf"
 LARGEST_GAP = 0.2
-"""Longest gap across which poses are interpolated, seconds: a motion capture at 10 Hz may miss one."""
+"""Longest interpolated gap, seconds: one miss at 10 Hz."""
 
 
 class TransformTree:
-    """Motions between named frames: each frame has one parent, and motions by time; a static frame has one motion.
-
-    Names are compared without the leading slash of tf.
-    """
+    """Motions between named frames: one parent each, by time or static. Names lack tf's leading slash."""
 
     def __init__(self) -> None:
         self._parents: dict[str, str] = {}
         self._motions: dict[str, dict[float, NDArray[np.float64]]] = {}
 
     def add(self, messages: Iterable[Any], *, static: bool) -> None:
-        """Add tf messages; static ones replace all others of their frame."""
+        """Add tf messages; static ones replace others of their frame."""
         for stamped in (stamped for message in messages for stamped in message.transforms):
             child, stamp = stamped.child_frame_id.lstrip("/"), stamped.header.stamp
             self._parents[child] = stamped.header.frame_id.lstrip("/")
@@ -197,7 +190,7 @@ class TransformTree:
             self._motions[child] = motions
 
     def between(self, target: str, source: str) -> NDArray[np.float64] | None:
-        """Motion (4, 4) of points of ``source`` into ``target`` along frames that do not move, or None."""
+        """Motion (4, 4) of points of ``source`` into ``target`` along static frames, or None."""
         up, down = self._path(source), self._path(target)
         common = next((frame for frame in up if frame in down), None)
         if common is None:
@@ -212,7 +205,7 @@ class TransformTree:
         return world.lstrip("/") in self._path(frame)[1:]
 
     def trajectory(self, world: str, frame: str, stamps: NDArray[np.float64]) -> Trajectory | None:
-        """Poses of ``frame`` in ``world`` at the times (N,) that all motions cover, interpolated on screws."""
+        """Poses of ``frame`` in ``world`` at the times (N,) that all motions cover, on screws."""
         path = self._path(frame)
         if world.lstrip("/") not in path:
             return None
@@ -249,7 +242,6 @@ class TransformTree:
 
 
 def _at(times: NDArray[np.float64], Ts: NDArray[np.float64], stamp: float) -> NDArray[np.float64] | None:
-    """Motion at a time, None outside the series and in its gaps."""
     if len(times) == 1:
         return Ts[0]
     k = int(np.searchsorted(times, stamp, side="right"))
@@ -275,11 +267,11 @@ COLOR_ENCODINGS = {
     "bayer_rggb8": (1, "COLOR_BayerRGGB2RGB"), "bayer_bggr8": (1, "COLOR_BayerBGGR2RGB"),
     "bayer_gbrg8": (1, "COLOR_BayerGBRG2RGB"), "bayer_grbg8": (1, "COLOR_BayerGRBG2RGB"),
 }  # fmt: skip
-"""Encoding (sensor_msgs/image_encodings) to number of channels and OpenCV's conversion to RGB."""
+"""Channels and OpenCV's conversion to RGB by encoding (sensor_msgs/image_encodings)."""
 DEPTH_ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encoding to type: 16-bit millimetres, or float metres (ROS REP 118)."""
 COMPRESSED_DEPTH_HEADER = struct.Struct("<i2f")
-"""Format number and two quantisation parameters before the PNG (compressed_depth_image_transport)."""
+"""Format and two quantisation parameters before the PNG (compressed_depth_image_transport)."""
 
 
 def color_of(message: Any, name: str) -> NDArray[np.uint8]:  # noqa: ANN401 - the type is made from the bag
@@ -325,7 +317,7 @@ def _pixels(message: Any, kind: np.dtype, channels: int, name: str) -> NDArray[A
 
 
 def _compressed_depth(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth of a PNG or RVL image; floats are 16-bit inverse depths q, z = a / (q - b), with a and b in the header."""
+    """Depth of PNG or RVL; floats are 16-bit inverse depths q, z = a / (q - b), a and b in the header."""
     data = bytes(message.data)
     if data.startswith(images.PNG):
         return images.decode_depth(data, depth_scale, name)

@@ -1,7 +1,7 @@
-"""Cameras in the content of a file of any name: text, JSON, YAML, NumPy arrays.
+"""Cameras in the content of any file: text, JSON, YAML, NumPy arrays.
 
-A camera is a matrix with the rows fx 0 cx, 0 fy cy, 0 0 1. Or it is focal lengths with a principal point under any
-usual name. The caller tests whether the numbers fit the images.
+A camera is a matrix with rows fx 0 cx, 0 fy cy, 0 0 1, or focal lengths and principal point under usual names; the
+caller tests whether it fits the images.
 """
 
 import re
@@ -35,17 +35,17 @@ LENSES = (
     "dist", "d",
 )  # fmt: skip
 ROWS = re.compile(r"intrin|calib|cam|param|^k$|^data$|^$")
-"""Names of a list ``fx fy cx cy`` that continues with a size or a lens."""
+"""Names of a list ``fx fy cx cy`` with size or lens."""
 KNOWN = sorted((name for names in ALIASES.values() for name in names), key=len, reverse=True)
 KEYED = re.compile(rf"(?:(.+)_)?({'|'.join(KNOWN)})(?:_(.+))?")
-"""Name of one number, with words that name its camera: ``fx_depth``, ``Camera.fx``."""
+"""Name of one number with words for its camera: ``fx_depth``, ``Camera.fx``."""
 LENS = ("k1", "k2", "p1", "p2", "k3")
 COLMAP = {"pinhole": 6, "opencv": 10}
-"""Models of COLMAP's cameras.txt and their count of numbers: width height fx fy cx cy [k1 k2 p1 p2]."""
+"""COLMAP's models and their number counts: width height fx fy cx cy [k1 k2 p1 p2]."""
 SKEW = 0.01
-"""Largest ignored skew, share of fx: it shifts the edge of an image by 1 % of its height."""
+"""Largest ignored skew, share of fx: 1 % of the height."""
 LEAST = 8.0
-"""Smallest focal length and principal point, pixels, as for images of 16 pixels; quaternions are smaller."""
+"""Smallest focal length and principal point, pixels; quaternions are smaller."""
 LEAST_SCALE = 100.0
 """Smallest scale of depth, units per metre (a centimetre)."""
 LARGEST_CONTENT = LARGEST_TOML
@@ -56,7 +56,7 @@ def cameras_in(file: Path) -> list[tuple[str, Values]]:
     """Names (lower case) and values by dudmap's keys of all cameras in a file; empty for other files.
 
     Raises:
-        DatasetError: A camera has an unsupported lens model.
+        DatasetError: Unsupported lens model.
     """
     tree = _tree(file)
     unit = depth_scale(tree) or 0
@@ -88,7 +88,7 @@ def _tree(file: Path) -> Any:  # noqa: ANN401 - dictionaries and lists
 
 
 def _tokens(text: str) -> Any:  # noqa: ANN401
-    """Names in a text and the numbers after each; a repeated name begins another camera."""
+    """Names in a text and their numbers; a repeated name begins another camera."""
     numbers: list[float] = []
     parts: list[dict[str, Any]] = [{}]
     words: list[str] = []
@@ -183,7 +183,6 @@ def _of_dictionary(tree: dict[str, Any], name: str) -> Iterator[tuple[str, Value
 
 
 def _may_be(key: str, below: Any) -> bool:  # noqa: ANN401
-    """Whether a value may hold cameras: a list of plain numbers needs a name of cameras."""
     if isinstance(below, list):
         return ROWS.search(key) is not None or not all(map(_is_number, below))
     return isinstance(below, dict)
@@ -206,7 +205,6 @@ def _by_place(numbers: list[Any]) -> Values:
 
 
 def _matrix(value: Any) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Matrix K (3, 3) of 9, 12 or 16 numbers by rows or columns; None for other values."""
     flat = _flat(value)
     if flat is None or len(flat) not in (9, 12, 16):
         return None

@@ -1,8 +1,5 @@
-"""Find intrinsics in files of known names: JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS, Kalibr,
-ORB-SLAM.
-
-A file that cannot be read or understood, or that holds too many cameras, raises a ``DatasetError``.
-"""
+"""Intrinsics in files of known names: Open3D, NICE-SLAM, librealsense, ZED, ROS, Kalibr, ORB-SLAM. Bad files raise a
+``DatasetError``."""
 
 import re
 from collections import Counter
@@ -27,15 +24,15 @@ FILES = (
     "intrinsics.txt", "intrinsics.K.txt", "K.txt", "cam_K.txt", "camera-intrinsics.txt", "camera_intrinsics.txt",
     "intrinsic.txt", "camera-intrinsics.npy", "intrinsics.npy", "cam_K.npy", "K.npy",
 )  # fmt: skip
-"""Files of one camera: text for ``from_file``, or a matrix as an array. The first existing file is used."""
+"""Files of one camera: text, or a matrix as an array; the first one is used."""
 TREES = ("camera_info.yaml", "calibration.yaml", "cam_params.json", "camera_intrinsic.json", "intrinsic.json")
-"""Files of one or two cameras. In the folder itself, also any JSON or YAML file with such a name (``NAMED``)."""
+"""Files of one or two cameras; also any JSON or YAML with such a name (``NAMED``)."""
 NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
 LARGEST_SETTINGS = 1 << 16
 LARGEST_LIST = 5
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr", ".webp")
 MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
-"""Names of a 4x4 matrix that maps points of the depth camera to the colour camera."""
+"""Names of a 4x4 matrix from depth to colour camera."""
 
 
 def find(folder: Path) -> Intrinsics | None:
@@ -74,7 +71,7 @@ def _of_file(file: Path) -> Intrinsics:
 
 
 def unknown(folder: Path, why: str = "") -> DatasetError:
-    """Error on a recording without intrinsics; names the existing files and the remedy."""
+    """Error on a recording without intrinsics: existing files and remedy."""
     return DatasetError(
         f"the camera of {folder} is not known{why}: neither {', '.join(FILES[:4])} nor another known file of "
         f"intrinsics (docs/formats.md) is in it or its parent, only {seen(folder)}; give --camera "
@@ -83,17 +80,17 @@ def unknown(folder: Path, why: str = "") -> DatasetError:
 
 
 def seen(folder: Path) -> str:
-    """Content of a folder: names with numbers replaced by N, and the count of each."""
+    """Content of a folder: names with numbers as N, and counts."""
     kinds = Counter(re.sub(r"\d+", "N", path.name) + "/" * path.is_dir() for path in sorted(folder.iterdir()))
     shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:LARGEST_LIST]]
     return ", ".join(shown) + (" ..." if len(kinds) > LARGEST_LIST else "") if shown else "nothing"
 
 
 def load(paths: Iterable[Path]) -> Intrinsics:
-    """Intrinsics of JSON and YAML files: of one camera, or of a depth and a colour camera.
+    """Intrinsics of JSON and YAML files: every object with focal lengths and principal point is a camera, of depth if
+    file or parent key contains "depth".
 
-    Every object with focal lengths and a principal point is a camera, a depth camera if the file name or a parent key
-    contains "depth". A depth scale below 1 is metres per unit.
+    A depth scale below 1 is metres per unit.
     """
     cameras: list[tuple[str, dict[str, float]]] = []
     scale, motion, files = {}, np.eye(4), list(paths)

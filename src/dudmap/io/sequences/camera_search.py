@@ -1,4 +1,4 @@
-"""Intrinsics in files of any name: for each kind of images, the only camera that fits their size is accepted."""
+"""Intrinsics in files of any name: the only camera that fits the images' size."""
 
 import os
 import re
@@ -19,13 +19,13 @@ SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".csv", ".npy", ".npz", ".cfg", ".
 FOLDERS = re.compile(r"config|.*(intrin|calib).*", re.IGNORECASE)
 MOST_NAMES = 5
 SAME = 0.5
-"""Largest difference of the numbers of one camera in two files, pixels."""
+"""Largest difference of one camera in two files, pixels."""
 FIELD_OF_VIEW = (20.0, 130.0)
-"""Plausible fields of view, degrees: from tele lenses to the widest depth mode."""
+"""Plausible fields of view, degrees."""
 OFF_CENTER = 0.25
-"""Largest plausible distance of the principal point from the middle of the image, share of its size."""
+"""Largest distance of the principal point from the centre, share of the size."""
 UNEQUAL_FOCAL = 0.1
-"""Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
+"""Largest difference of fx and fy, share."""
 SCALED = ", scaled from "
 COLOR_WORDS, OTHER_WORDS = r"colou?r|rgb(?!_?d)|left", r"right|infra"
 
@@ -33,7 +33,7 @@ Size = tuple[int, int]
 
 
 class Found(NamedTuple):
-    """Camera of a file for one kind of images, with the size in the file if it was scaled."""
+    """Camera of a file for one kind of images."""
 
     file: Path
     kind: str
@@ -44,10 +44,10 @@ class Found(NamedTuple):
 def known(
     folder: Path, published: Intrinsics | None, sizes: Callable[[], tuple[Size, Size] | None], why: str = ""
 ) -> Intrinsics:
-    """Intrinsics of a recording: from a file of a usual name, else the published ones, else from any file that fits.
+    """Intrinsics of a recording: a file of usual name, the published ones, or any file that fits.
 
     Args:
-        sizes: Width and height of the depth and of the colour images, None if no image can be read.
+        sizes: Width and height of depth and colour images, None if unreadable.
 
     Raises:
         DatasetError: No file gives one camera.
@@ -76,10 +76,10 @@ def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
     """Intrinsics in a folder, its parent, or their configuration folders; None without any.
 
     Args:
-        depth, color: Width and height of the images.
+        depth, color: Image width and height.
 
     Raises:
-        DatasetError: Files contradict each other, or none fits the images.
+        Camera for the images that it fits, depth first, or None.
     """
     misfits: list[str] = []
     for place in (folder, folder.resolve().parent):
@@ -115,7 +115,6 @@ def _is_small(file: Path) -> bool:
 
 
 def _fitting(file: Path, name: str, values: Values, depth: Size, color: Size) -> Found | None:
-    """Camera for the kind of images that it fits, depth if it fits both, or None."""
     if re.search(OTHER_WORDS, name):
         return None
     kinds = {"depth": depth, "color": color}
@@ -142,7 +141,6 @@ def _fitting(file: Path, name: str, values: Values, depth: Size, color: Size) ->
 
 
 def _is_multiple(given: Size, size: Size) -> bool:
-    """Whether the larger size is 1.5, 2, 2.5, 3, ... times the smaller one."""
     if not all(given) or abs(given[0] * size[1] / (given[1] * size[0]) - 1) > SAME_SHAPE:
         return False
     factor = max(given[0] / size[0], size[0] / given[0])
@@ -201,7 +199,6 @@ def _distinct(cameras: list[Found]) -> list[Found]:
 
 
 def _is_same(one: Values, other: Values) -> bool:
-    """Whether numbers agree; a lens that only one has does not count."""
     near = all(abs(one[key] - other[key]) <= SAME for key in ("fx", "fy", "cx", "cy"))
     return near and all(one[key] == other[key] for key in one.keys() & other.keys() & {"k1", "k2", "p1", "p2", "k3"})
 

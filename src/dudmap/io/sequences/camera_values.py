@@ -1,4 +1,4 @@
-"""Intrinsics in a tree of JSON or YAML values, under the names that other programs use."""
+"""Intrinsics in JSON or YAML values under usual names."""
 
 import math
 import re
@@ -15,7 +15,7 @@ from dudmap.input_files import LARGEST_TREE, read_text
 from dudmap.io.sequences.intrinsics import DISTORTION_KEYS, INVERSE, KEYS, brown_of_inverse, camera_values
 
 SETTINGS = "Camera.", "Camera1."
-"""Prefixes of camera keys in settings files of ORB-SLAM, of any name."""
+"""Prefixes of camera keys in ORB-SLAM's settings files."""
 NAMES = {
     "fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y"), "cx": ("cx", "ppx", "principal_x"),
     "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"),
@@ -29,8 +29,8 @@ OTHER_LENSES = ("equidistant", "fisheye", "kannala_brandt4", "equi")
 
 
 def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
-    """Numbers by dudmap's keys of one JSON object, or None. A matrix has 9 numbers row by row, column by column
-    (Open3D), or 3 rows."""
+    """Numbers by dudmap's keys of one object, or None; a matrix has 9 numbers by rows, by columns (Open3D), or 3
+    rows."""
     values = {}
     tree = tree | {str(key).partition(".")[2]: tree[key] for key in tree if str(key).startswith(SETTINGS)}
     for key, names in NAMES.items():
@@ -63,7 +63,7 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Nested dictionaries and lists of a YAML file, without OpenCV's header and type names."""
+    """Tree of a YAML file, without OpenCV's header and type names."""
     try:
         text = re.sub(r"^%YAML.*\n|!!opencv-\w+", "", read_text(path, LARGEST_TREE))
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
@@ -79,7 +79,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def depth_scale(tree: Any) -> float | None:  # noqa: ANN401
-    """Depth units per metre anywhere in a JSON value."""
+    """Depth units per metre anywhere in a tree."""
     if not isinstance(tree, dict | list):
         return None
     for value in (tree.get(name) for name in SCALES) if isinstance(tree, dict) else ():
@@ -99,7 +99,7 @@ def _is_finite(value: Any) -> TypeGuard[int | float]:  # noqa: ANN401 - any JSON
 
 
 def numbers_of(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
-    """Numbers (count,) of a list or of a list of rows; None for other values."""
+    """Numbers (count,) of a list, or of rows; None for other values."""
     if not isinstance(value, list):
         return None
     flat = [number for row in value for number in (row if isinstance(row, list) else [row])]

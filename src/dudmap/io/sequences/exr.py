@@ -1,7 +1,5 @@
-"""Depth in OpenEXR images (https://openexr.com/en/latest/OpenEXRFileLayout.html), as Record3D and Blender write it.
-
-Supported are files of one part, in lines, uncompressed or deflated by zlib; OpenCV's wheels lack its decoder.
-"""
+"""Depth in OpenEXR images (https://openexr.com/en/latest/OpenEXRFileLayout.html): one part, in lines, uncompressed or
+zlib, which OpenCV's wheels cannot decode."""
 
 import struct
 import zlib
@@ -16,9 +14,9 @@ from dudmap.input_files import damaged
 
 MAGIC = b"v/1\x01"
 NOT_ONE_PART_IN_LINES = 0x02 | 0x08 | 0x10
-"""Flags of tiles, deep images and several parts, in the byte behind the version."""
+"""Flags of tiles, deep images and several parts."""
 LINES = {0: 1, 2: 1, 3: 16}
-"""Lines of a block by the number of the compression: none, ZIPS and ZIP."""
+"""Lines of a block by compression: none, ZIPS and ZIP."""
 KINDS = ("<u4", "<f2", "<f4")
 DEPTH_CHANNELS = "RYVZ"
 """Last letter of depth channel names, by increasing certainty."""
@@ -69,7 +67,6 @@ def _channels(listed: bytes) -> Iterator[tuple[str, str]]:
 
 
 def _inflated(block: bytes, size: int) -> bytes:
-    """Bytes stored as they are, or deflated differences of two halves."""
     if len(block) == size:
         return block
     packed = np.frombuffer(zlib.decompressobj().decompress(block, size + 1), np.uint8)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.trajectory import Trajectory
 
 NEAR = 0.05
-"""Largest time between a measurement and its pose, seconds: one and a half frames at 30 Hz."""
+"""Largest time between a measurement and its pose, seconds."""
 
 
 class Gravity(NamedTuple):
@@ -16,8 +16,8 @@ class Gravity(NamedTuple):
 
     Attributes:
         timestamps: (N,) times of the measurements, seconds.
-        ups: (N, 3) unit vectors against gravity in the axes of the depth camera (x right, y down, z forward).
-        source: Of the measurements: a file or topic.
+        ups: (N, 3) unit vectors against gravity, depth camera axes.
+        source: A file or topic.
     """
 
     timestamps: NDArray[np.float64]
@@ -28,14 +28,14 @@ class Gravity(NamedTuple):
     def of_rotations(
         cls, rotations: list[tuple[float, NDArray[np.float64]]], up: tuple[float, float, float], source: str
     ) -> "Gravity | None":
-        """Measurements from timed rotations (3, 3) of the camera into a world with a known up direction."""
+        """Measurements from timed rotations (3, 3) of the camera into a world with a known up."""
         if not rotations:
             return None
         ups = np.array([np.asarray(up) @ R for _, R in rotations])
         return cls(np.array([stamp for stamp, _ in rotations]), ups, source)
 
     def in_world(self, poses: Trajectory) -> "MeasuredUp | None":
-        """The mean direction in the world of a run with these poses; None if no measurement is near one of them."""
+        """Mean direction in the world of a run; None if no measurement is near one of them."""
         if not len(poses) or not len(self.timestamps):
             return None
         stamps = poses.timestamps
@@ -52,12 +52,11 @@ class Gravity(NamedTuple):
 
 
 class MeasuredUp(NamedTuple):
-    """The direction against gravity that a recording measured, in the world of a run.
+    """Direction against gravity of a recording in the world of a run.
 
     Attributes:
         direction: (3,) unit vector.
-        sigma_deg: Root mean square angle of the measurements to it, degrees.
-        readings: Their number.
+        sigma_deg: Root mean square angle, degrees.
     """
 
     direction: NDArray[np.float64]
@@ -67,7 +66,7 @@ class MeasuredUp(NamedTuple):
 
 
 def mean_direction(vectors: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, float]:
-    """Mean (3,) of unit vectors (N, 3), None if they cancel out, and their root mean square angle to it, degrees."""
+    """Mean (3,) of unit vectors (N, 3), None if they cancel out, and root mean square angle to it, degrees."""
     mean = vectors.mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length < 1e-9:

@@ -21,23 +21,23 @@ from dudmap.io.sequences.rotated_depth import Rotated
 
 PROBES = 30
 OFF_CENTER = 0.08
-"""Largest distance of a plausible principal point from the image centre, share of the image."""
+"""Largest offset of a plausible principal point, share of the image."""
 FRAME_RATE = 30.0
-"""Assumed frames per second of recordings with frame numbers only: the rate of most depth cameras."""
+"""Assumed rate without times, 1/s: of most depth cameras."""
 
 
 class ImageFolder(Recording):
-    """Base class of recordings whose frames are a colour file and a depth file each, or a depth file alone.
+    """Base class of recordings with a colour and a depth file, or a depth file, per frame.
 
-    A format defines the names of its files (``color_files`` and so on) or their pairing (``_find_pairs``). Optionally
-    it defines its cameras (``published``), its ground truth (``_find_ground_truth``) and ``_read_depth``.
+    A format defines its files (``color_files`` and so on) or pairing (``_find_pairs``), and optionally cameras
+    (``published``), ground truth (``_find_ground_truth``) and ``_read_depth``.
 
     Args:
-        camera: Intrinsics that replace the recording's, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``. Colour
-            images of another size than depth keep their own camera.
+        camera: Replaces the recording's intrinsics: a Camera or ``fx,fy,cx,cy[,w,h[,depth_scale]]``. Colour of another
+            size keeps its own camera.
 
     Raises:
-        DatasetError: A file of the layout is missing or malformed, no images can be paired, or no frame is valid.
+        DatasetError: A file is missing or malformed, no images pair, or no frame is valid.
     """
 
     options: tuple[str, ...] = ("fps", "depth_unit")
@@ -46,11 +46,11 @@ class ImageFolder(Recording):
     color_files: tuple[str, str] = ("rgb", r"(\d+)\.png")
     depth_files: tuple[str, str] = ("depth", r"(\d+)\.png")
     pose_files: tuple[str, str] | None = None
-    """Folder and name pattern of numbered files: images, and camera-to-world matrices."""
+    """Folder and name pattern of images and camera-to-world matrices."""
     pose_list = ""
-    """File of true poses with a camera-to-world matrix per frame."""
+    """File with a camera-to-world matrix per frame."""
     published: tuple[str, dict[str, float]] | None = None
-    """Name and published camera of the data set, for formats of one data set."""
+    """Name and camera of the data set."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path)
@@ -73,8 +73,6 @@ class ImageFolder(Recording):
         self._take_truth()
 
     def _look_for_rotation(self, *, given: bool) -> None:
-        """Set the unit of depth images that are rotated by three bits."""
-
         def read(index: int) -> NDArray[np.float32]:
             return self._read_depth(self._pairs[index][1].path, 1.0)
 
@@ -85,7 +83,7 @@ class ImageFolder(Recording):
         self._unit_remark = "" if given and self.rotated is Rotated.YES else self.rotated.value
 
     def set_depth_unit(self, unit: float) -> None:
-        """As for ``Recording``; rotated values stay rotated if the unit is 0.125 mm."""
+        """As for ``Recording``; rotated values need 0.125 mm."""
         super().set_depth_unit(unit)
         self._look_for_rotation(given=True)
         self.rotated, self._unit_remark = self.rotated if self.rotated is Rotated.YES else Rotated.NO, ""
@@ -97,7 +95,6 @@ class ImageFolder(Recording):
         return f"the recording{taken}"
 
     def _take_truth(self) -> None:
-        """Set the ground truth; if unreadable, it is omitted with a remark."""
         try:
             self.ground_truth = self._find_ground_truth()
             said = self.ground_truth.remarks if self.ground_truth is not None else ()
@@ -108,12 +105,12 @@ class ImageFolder(Recording):
 
     @property
     def image_files(self) -> list[tuple[Path, Path]]:
-        """Files of the colour and the depth image of all frames."""
+        """Colour and depth files of all frames."""
         return [(color.path, depth.path) for color, depth in self._pairs]
 
     @property
     def color_timestamps(self) -> NDArray[np.float64]:
-        """(N,) timestamps of the colour images of all frames, seconds."""
+        """(N,) timestamps of the colour images, seconds."""
         return np.array([color.timestamp for color, _ in self._pairs], dtype=np.float64)
 
     def _frame(self, index: int, name: str) -> Frame:
@@ -136,7 +133,7 @@ class ImageFolder(Recording):
         )
 
     def set_rate(self, fps: float) -> None:
-        """Replace the assumed rate of numbered frames, in usual steps of their numbers per second.
+        """Replace the assumed rate of numbered frames.
 
         Raises:
             DatasetError: The recording has its own times.
@@ -177,7 +174,6 @@ class ImageFolder(Recording):
         return None if self.published is None else intrinsics.by_name(*self.published)
 
     def _one_view(self, cameras: list[dict[str, float]], source: str) -> intrinsics.Intrinsics:
-        """Intrinsics of depth images with the view of the colour images, from the median of ``cameras``."""
         color, depth = (self._read_color(self._pairs[0][0].path), self._read_depth(self._pairs[0][1].path, 1.0))
         (height, width), unit = color.shape[:2], {"depth_scale": self.depth_scale}
         values = {key: float(np.median([camera.get(key, 0.0) for camera in cameras])) for key in cameras[0]}
@@ -205,7 +201,7 @@ class ImageFolder(Recording):
     def _pair_numbered(
         self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None
     ) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files of equal numbers, timed by number over ``per_second``; None: numbers count frames at
+        """(colour, depth) files of equal numbers, at number over ``per_second``; None: numbers count frames at
         ``FRAME_RATE``."""
         numbers = sorted(colors.keys() & depths.keys())
         if not numbers:
@@ -223,7 +219,6 @@ class ImageFolder(Recording):
         return [(depth, depth) for depth in depths]
 
     def _pair_timed(self, colors: list[TimedFile], depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart."""
         pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
         if not pairs:
             raise DatasetError(
@@ -242,7 +237,7 @@ class ImageFolder(Recording):
         return images.read_color(path)
 
     def _replaced(self, camera: Camera | str) -> intrinsics.Intrinsics:
-        """The given intrinsics, with the recording's colour camera if it has another size."""
+        """Given intrinsics, with the recording's colour camera of another size."""
         given = intrinsics.given(camera)
         try:
             own = self._find_intrinsics()
@@ -272,7 +267,6 @@ class ImageFolder(Recording):
         return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera with the size of the first valid frame; a missing colour camera gets the same field of view."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -313,6 +307,6 @@ def size(image: NDArray) -> str:
 
 
 def numbered_files(paths: Iterable[Path], pattern: str) -> dict[int, Path]:
-    """Files by the number in the first group of a pattern of the whole file name; other files are skipped."""
+    """Files by the number in the first group of a pattern of the file name."""
     matches = ((re.fullmatch(pattern, path.name), path) for path in paths)
     return {int(match.group(1)): path for match, path in sorted(matches, key=lambda item: item[1].name) if match}

@@ -1,4 +1,4 @@
-"""Headers of image files: format, size, and kind of the values (depth or colour)."""
+"""Headers of image files: format, size, depth or colour."""
 
 import re
 import struct
@@ -12,17 +12,17 @@ from dudmap.io.sequences import exr
 PNG, JPEG, TIFF = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", (b"II*\0", b"MM\0*")
 LARGEST_HEADER = 1 << 16
 LARGEST_SCANS = 100
-"""Largest number of passes of a progressive JPEG file; encoders write up to 10, and each takes time."""
+"""Passes of a progressive JPEG file; encoders write up to 10."""
 _TIFF_TYPES = {3: "H", 4: "I"}
 _JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}
 
 
 def check_size(data: bytes, name: str) -> None:
-    """Check the format and size of an image; ``name`` is used in messages.
+    """Check the format and size of an image;
 
     Raises:
-        FrameError: It is in a format that need not be supported, too large, or its header is damaged.
+        FrameError: Unsupported format, too large, or damaged.
     """
     read = next((read for magic, read in _FORMATS.items() if data.startswith(magic)), None)
     if read is None:
@@ -109,11 +109,11 @@ _FORMATS = {
     PNG: _png, JPEG: _jpeg, **dict.fromkeys(TIFF, _tiff), b"BM": _bmp, b"RIFF": _webp,
     **{b"P" + digit: _pnm for digit in (b"1", b"2", b"3", b"4", b"5", b"6", b"f", b"F")},
 }  # fmt: skip
-"""First bytes of the supported formats, and the function that finds the size."""
+"""Functions that find the size, by first bytes."""
 
 
 def kind_of(file: Path) -> str:
-    """Kind of the values of an image file, see ``content``; empty if the file cannot be read."""
+    """Kind of an image file, see ``content``; empty if unreadable."""
     try:
         with open_plain(file) as opened:
             data = opened.read(LARGEST_HEADER)
@@ -123,11 +123,10 @@ def kind_of(file: Path) -> str:
 
 
 def content(data: bytes) -> str:
-    """Kind of the values of an image by its header.
+    """Kind of an image by its header.
 
     Returns:
-        ``depth`` (one channel of 16 bits or floats), ``color`` (8-bit colours), ``gray`` (8-bit intensities), or
-        ``other`` (such as palettes). Empty for data that are no image.
+        ``depth`` (one channel of 16 bits or floats), ``color``, ``gray`` (8 bit), or ``other``; empty for no image.
     """
     try:
         if data.startswith(PNG):

@@ -1,5 +1,5 @@
-"""Files with one frame after another: ScanNet's ``.sens`` (Dai et al. 2017), ElasticFusion's ``.klg`` and Record3D's
-``.r3d``. The latter is a ZIP archive of JPEG colour and LZFSE depth."""
+"""Files with one frame after another: ScanNet's ``.sens`` (Dai et al. 2017), ElasticFusion's ``.klg``, Record3D's
+``.r3d`` (a ZIP archive of JPEG and LZFSE)."""
 
 import struct
 import zipfile
@@ -23,15 +23,15 @@ from dudmap.io.sequences.phones import record3d_times
 
 SENS_VERSION = 4
 SENS_FRAME = struct.Struct("<16f4Q")
-"""Pose camera to world row by row, colour and depth time in microseconds, bytes of the colour and depth image."""
+"""Pose camera to world by rows, times in microseconds, bytes of the images."""
 KLG_FRAME = struct.Struct("<qii")
-"""Time in microseconds, bytes of the depth image and bytes of the colour image."""
+"""Time in microseconds, bytes of depth and colour."""
 PERIOD = 1 / 30
-"""Seconds between frames without usable times: the rate of ScanNet's Structure Sensor."""
+"""Seconds between frames without times: ScanNet's Structure Sensor."""
 
 
 class FrameEntry(NamedTuple):
-    """Offset of a frame in the file, bytes of its two images in file order, and times in microseconds."""
+    """Offset of a frame, bytes of its images in file order, times in microseconds."""
 
     offset: int
     sizes: tuple[int, int]
@@ -40,7 +40,7 @@ class FrameEntry(NamedTuple):
 
 
 class _FrameLog(Recording):
-    """Base of the formats that hold two images after each header; opening reads only the headers."""
+    """Base of these formats; opening reads only headers."""
 
     options: tuple[str, ...] = ("depth_unit",)
     _entries: list[FrameEntry]
@@ -66,11 +66,7 @@ class _FrameLog(Recording):
 
 
 class SensRecording(_FrameLog):
-    """Recording in a ``.sens`` file.
-
-    Colour images are larger and come from another camera, which ``calibration`` holds. Times that are all zero or do
-    not increase become 1/30 s apart.
-    """
+    """``.sens`` file. Colour comes from another camera (``calibration``). Useless times become 1/30 s apart."""
 
     format = "ScanNet .sens"
     suffix = ".sens"
@@ -95,7 +91,6 @@ class SensRecording(_FrameLog):
         self.ground_truth = truth if valid.any() else None
 
     def _read_header(self, file: IO[bytes], camera: Camera | str | None) -> int:
-        """Set the cameras, and return the number of frames."""
         (version,) = _unpack(file, "<I")
         if version != SENS_VERSION:
             raise DatasetError(
@@ -143,10 +138,10 @@ class SensRecording(_FrameLog):
 
 
 class KlgRecording(_FrameLog):
-    """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
+    """``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
-    Depth is in millimetres (raw or zlib), colour raw or JPEG. The file has no intrinsics. The image size comes from
-    given ones, else from the first JPEG image, else it is the logger's 640x480.
+    Depth is in millimetres (raw or zlib), colour raw or JPEG; no intrinsics. The size is given, the first JPEG image's,
+    or 640x480.
     """
 
     format = "ElasticFusion .klg"
@@ -215,15 +210,14 @@ def _unpack(file: IO[bytes], form: str) -> tuple:
 
 
 LARGEST_COMMAND = 315 + 2359
-"""Most bytes that one command of an LZFSE block can write."""
+"""Bytes that one command of an LZFSE block can write."""
 
 
 class Record3DRecording(Recording):
-    """Recording in a ``.r3d`` file.
+    """``.r3d`` file.
 
-    Depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than colour and seen from the same place. The
-    depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Depth of confidence 0 is
-    omitted. ARKit's poses are no ground truth.
+    Depth (LiDAR 256x192, front camera 640x480) is smaller than colour and has its view. Depth of confidence 0 is
+    omitted; ARKit's poses are no ground truth.
     """
 
     format = "Record3D .r3d"
@@ -294,10 +288,10 @@ class Record3DRecording(Recording):
 
 
 def largest_unpacked(packed: bytes) -> int:
-    """Upper bound of the bytes to which LZFSE data unpack, from the headers of their blocks.
+    """Largest unpacked size of LZFSE data, from block headers.
 
     A command of a block ``bvx2`` writes at most 315 literals and a match of 2359 bytes (Apple's reference
-    implementation, lzfse_internal.h). Its decoder does not stop at the declared size.
+    implementation, lzfse_internal.h), even beyond the declared size.
 
     Raises:
         ValueError: A block is cut off or of another kind.

@@ -1,4 +1,4 @@
-"""Numbers in image names that pair colour and depth: counts, times, or all numbers of a name."""
+"""Numbers in image names that pair colour and depth."""
 
 import re
 from collections.abc import Iterator
@@ -11,11 +11,11 @@ from dudmap.core.geometry.association import associate
 from dudmap.core.geometry.times import time_unit
 
 NUMBER = r"\d+(?:\.\d+)?"
-"""A number in a name; a decimal number counts as one."""
+"""A number in a name, with decimals."""
 LARGEST_NUMBER = 10**8
-"""Numbers of this size and more are times, not frame numbers: 38 days at 30 Hz."""
+"""Larger numbers are times: 38 days at 30 Hz."""
 LARGEST_SECONDS = 10**11
-"""Largest time since 1970 in seconds; larger numbers have a smaller unit."""
+"""Largest time since 1970, seconds; larger numbers have smaller units."""
 Keys = tuple[list[float], list[float]]
 
 
@@ -25,11 +25,8 @@ def last_number(file: Path) -> float:
 
 
 def keys(colors: list[Path], depths: list[Path]) -> Keys:
-    """Numbers by which most of the images pair.
-
-    The candidates are ``<seconds>_<fraction>``, the last number, each earlier number, and the rank of a name in the
-    order of all its numbers.
-    """
+    """Numbers by which most images pair: ``<seconds>_<fraction>``, the last number, an earlier one, or the rank in the
+    order of all."""
     best, most = None, -1
     for found in _kinds_of_keys(colors, depths):
         count = _count(found)
@@ -47,7 +44,7 @@ def count_pairs(colors: list[Path], depths: list[Path]) -> int:
 
 
 def are_times(found: Keys) -> bool:
-    """Whether numbers are times, which need not be equal: large or decimal ones."""
+    """Whether numbers are times: large or decimal."""
     values = np.concatenate(found)
     return bool(max(found[0]) >= LARGEST_NUMBER or np.any(values != np.floor(values)))
 

@@ -1,8 +1,7 @@
-"""Recognition of colour and depth among the numbered images of a folder, by names and by content.
+"""Colour and depth among numbered images, by names and content.
 
-A series is the images of one folder whose names differ by numbers alone, such as ``rgb_0001.png``. Words in names
-decide first. If they are ambiguous or contradict the content, one channel of 16 bits or floats is depth, 8-bit colours
-are colour.
+A series is the images of one folder whose names differ by numbers alone. Words in names decide; if ambiguous or
+contradicted, one channel of 16 bits or floats is depth, 8-bit colours are colour.
 """
 
 import os
@@ -29,18 +28,18 @@ CONTENTS = {
 }  # fmt: skip
 PROBED = 3
 LEAST_SHARE = 0.25
-"""Smallest share of the longer of two series with a partner, if content alone pairs them, and of the images of its
-kind in a series that replaces another."""
+"""Smallest share with a partner of the longer of two series paired by content, and of its kind in a series that
+replaces another."""
 LARGEST_LIST = 5
 Found = dict[str, "Series | None"]
 
 
 @dataclass
 class Series:
-    """Images of one folder whose names differ by numbers alone.
+    """Images of one folder whose names differ by numbers.
 
     Attributes:
-        kind: ``depth``, ``color``, ``neither``, or empty: by names, and by content if names contradict each other.
+        kind: ``depth``, ``color``, ``neither``, or empty: by names, else by content.
     """
 
     label: str
@@ -49,24 +48,24 @@ class Series:
 
     @cached_property
     def content(self) -> str:
-        """Kind of the values (``image_headers.content``); empty if the sampled images differ or none is readable."""
+        """Kind of the values (``image_headers.content``); empty if mixed or unreadable."""
         sampled = {self.files[k] for k in np.linspace(0, len(self.files) - 1, PROBED).astype(int)}
         kinds = {kind for file in sampled if (kind := kind_of(file))}
         return kinds.pop() if len(kinds) == 1 else ""
 
     @property
     def fits(self) -> bool:
-        """Whether the content may be of the kind in the names."""
+        """Whether content and names agree."""
         return self.content not in {"depth": ("color", "gray", "other"), "color": ("depth",)}.get(self.kind, ())
 
     def may_be(self, kind: str) -> bool:
-        """Whether the content is of a kind; colour images named depth are visualisations and do not count."""
+        """Whether the content is of a kind; colourised depth does not count."""
         if self.kind == "neither" or (kind, self.kind) == ("color", "depth"):
             return False
         return self.content == kind or (kind == self.kind == "color" and self.content == "gray")
 
     def rank(self, kind: str) -> tuple[bool, list[bool]]:
-        """Sort key of the series that may be of a kind: surest names first."""
+        """Sort key: surest names first."""
         return self.kind != kind, [word not in self.label.lower() for word in WORDS[kind]]
 
     def __str__(self) -> str:
@@ -74,13 +73,13 @@ class Series:
 
 
 def is_numbered_image(name: str) -> bool:
-    """Whether a file is a numbered image by its name."""
+    """Whether a name is a numbered image's."""
     stem, suffix = os.path.splitext(name)
     return suffix.lower() in IMAGES and not name.startswith(".") and re.search(r"\d", stem) is not None
 
 
 def kind_by_name(name: str) -> str:
-    """``depth``, ``color``, ``neither``, or empty, by the words of a name."""
+    """``depth``, ``color``, ``neither``, or empty, by words."""
     words = re.findall("[a-z]+", name.lower())
     if any(word in NEITHER or word.startswith(NEITHER_STARTS) for word in words):
         return "neither"
@@ -89,10 +88,10 @@ def kind_by_name(name: str) -> str:
 
 
 def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
-    """Colour and depth images of a folder by given patterns, else by names, else by content; may be empty.
+    """Colour and depth images by patterns, names or content; may be empty.
 
     Raises:
-        DatasetError: A pattern matches no numbered image, or several series may be meant.
+        DatasetError: A pattern matches nothing, or several series match.
     """
     given = {kind: _matching(path, kind, pattern) for kind, pattern in (patterns or {}).items() if pattern}
     found = by_names(path) | given
@@ -102,7 +101,7 @@ def find(path: Path, patterns: Mapping[str, str | None] | None = None) -> Found:
 
 
 def by_names(path: Path) -> Found:
-    """Colour and depth images by words in names: in the folder, else in one subfolder of each kind."""
+    """Images by words in names: in the folder, else in one subfolder each."""
     own = _series_in(path)
     found = {kind: _surest(own, kind) for kind in WORDS}
     if (depth := found["depth"]) and not found["color"]:  # 0001.jpg is the colour of 0001_depth.png
@@ -116,9 +115,7 @@ def by_names(path: Path) -> Found:
 
 
 def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
-    """Pairs of colour and depth images, by content if names are ambiguous; empty if there are none.
-
-    A subfolder with images of both kinds is a separate recording.
+    """Pairs of images, by content if names are ambiguous; a subfolder with both kinds is a separate recording.
 
     Raises:
         DatasetError: Several series may be meant.
@@ -131,7 +128,7 @@ def by_content(path: Path, given: dict[str, Series] | None = None) -> Found:
 
 
 def alone(path: Path, given: dict[str, Series] | None = None) -> Found:
-    """Depth images of a folder without possible colour images; empty if there are none.
+    """Depth images of a folder without possible colour.
 
     Raises:
         DatasetError: Several series may be meant.
@@ -147,7 +144,7 @@ def alone(path: Path, given: dict[str, Series] | None = None) -> Found:
 
 
 def unknown(path: Path) -> str:
-    """Sentence on a folder whose images are not recognised as depth and colour; empty if it has no images."""
+    """Sentence on unrecognised images; empty if there are none."""
     there = _there(path)
     return there and (
         f"{path} holds images in no known layout: {there}; expected colour images of 8 bit and depth images of 16 bit "
@@ -215,7 +212,6 @@ def _everything(path: Path) -> list[Series]:
 
 
 def _surest(series: list[Series], kind: str) -> Series | None:
-    """The surest series of a kind, with others of its folder and kind that have other numbers."""
     known = [one for one in series if one.kind == kind]
     enough = LEAST_SHARE * max((len(one.files) for one in known), default=0)
     known.sort(

@@ -1,7 +1,4 @@
-"""Decoding of colour, depth and mask images; every defect of a file raises a ``FrameError``.
-
-The declared size is read before a decoder takes memory for it.
-"""
+"""Decoding of colour, depth and mask images; defects raise a ``FrameError``. The size is checked before allocation."""
 
 import struct
 import zlib
@@ -27,7 +24,7 @@ def read_color(path: Path) -> NDArray[np.uint8]:
 
 
 def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """Colour image (H, W, 3) in RGB order from the content of an image file; ``name`` is used in messages."""
+    """Colour image (H, W, 3), RGB, from the content of a file; ``name`` is used in messages."""
     import cv2
 
     image = _decoded(data, name, cv2.IMREAD_COLOR)
@@ -45,7 +42,7 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
 
 
 def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str) -> NDArray[np.float32]:
-    """Depth image (H, W) in metres from the content of an image file; ``name`` is used in messages."""
+    """Depth image (H, W) in metres from the content of a file; ``name`` is used in messages."""
     import cv2
 
     raw = bytes(data)
@@ -56,7 +53,7 @@ def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str)
 
 
 def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.float32]:
-    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = missing."""
+    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or float metres; 0 = missing."""
     if image.dtype == np.uint16:
         return image.astype(np.float32) / np.float32(depth_scale)
     if image.dtype.kind == "f":
@@ -67,7 +64,7 @@ def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.flo
 
 
 def read_depth_array(path: Path) -> NDArray[np.float32]:
-    """Depth image (H, W) in metres of a ``.npy`` file of floats; (H, W, 1) is taken, too."""
+    """Depth image (H, W) or (H, W, 1) in metres of a ``.npy`` file."""
     try:
         depth = np.squeeze(load_array(path))
     except (OSError, ValueError, EOFError) as error:
@@ -78,15 +75,15 @@ def read_depth_array(path: Path) -> NDArray[np.float32]:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Mask (H, W) of an 8-bit image; values above 127 are true."""
+    """Mask (H, W) of an 8-bit image; above 127 is true."""
     return read_gray(path) > 127
 
 
 def read_ignored(path: str | Path, camera: Camera, calibration: "Calibration | None" = None) -> NDArray[np.bool_]:
-    """Mask (H, W) of ignored pixels, from an image in which they are white (above 127).
+    """Ignored pixels (H, W) of an image, white (above 127).
 
     Raises:
-        DatasetError: There is no such image, or it has the size of neither the depth nor the colour image.
+        DatasetError: There is no such image, or it has neither image's size.
     """
     path = Path(path)
     if not path.is_file():
@@ -121,7 +118,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[Any]:
-    """Image as it is stored, without EXIF orientation, which depth images lack."""
+    """The stored image; depth lacks EXIF orientation."""
     import cv2
 
     with damaged(FrameError, name):
@@ -132,7 +129,7 @@ def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[
 
 
 def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """Content of a complete image file; decoders fill missing parts with grey."""
+    """Content of a complete file; decoders fill gaps with grey."""
     raw = bytes(data)
     if not raw:
         raise FrameError(f"{name} is an empty file")
@@ -145,7 +142,7 @@ def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
 
 
 def _check_png(name: str, data: bytes) -> None:
-    """Check all chunks: length, type, data, CRC-32 of type and data (PNG specification, section 5.3)."""
+    """Check length, type, data and CRC-32 of all chunks (PNG specification, section 5.3)."""
     at = len(PNG)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)

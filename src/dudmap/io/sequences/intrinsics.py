@@ -1,7 +1,4 @@
-"""Intrinsics of a recording: from text, from its own file, or published for its data set; lenses.
-
-Numbers that are missing, invalid or for images of another size raise a ``DatasetError``.
-"""
+"""Intrinsics of a recording: text, its file, or published; lenses. Bad numbers raise a ``DatasetError``."""
 
 import math
 import re
@@ -24,12 +21,12 @@ DEPTH_SCALE = 5000.0
 """Default depth units per metre in the TUM layout."""
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
 COLOR_PREFIX = "color_"
-"""Prefix of the keys of a separate colour camera: fx, fy, cx, cy, width, height, and its distortion coefficients."""
+"""Prefix of keys of a separate colour camera."""
 COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
 SAME_SHAPE = 0.01
-"""Largest relative difference of aspect ratios of one view."""
+"""Largest difference of aspect ratios of one view."""
 MOTION_KEY = "T_depth_color"
-"""Key of the motion from the colour camera to the depth camera: 12 or 16 numbers, row by row."""
+"""Key of the motion colour to depth camera: 12 or 16 numbers, by rows."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +34,10 @@ class Intrinsics:
     """Intrinsics before the image size is known.
 
     Attributes:
-        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present, others optional.
-        source: Origin of the numbers, for error messages.
-        color: Numbers of the colour images' camera by key, empty if it is the same.
-        T_depth_color: (4, 4) points of the colour camera to the depth camera.
+        values: Numbers by key (``KEYS``); fx, fy, cx and cy always.
+        source: Origin, for messages.
+        color: Numbers of the colour camera, empty if the same.
+        T_depth_color: (4, 4).
     """
 
     values: dict[str, float]
@@ -83,12 +80,12 @@ def _camera(values: dict[str, float], depth_scale: float) -> Camera:
 
 
 def camera_values(*numbers: float) -> dict[str, float]:
-    """Numbers of a camera by key, in the order of ``KEYS``."""
+    """Numbers of a camera in the order of ``KEYS``."""
     return dict(zip(KEYS, map(float, numbers), strict=False))
 
 
 BY_NAME = ", by name"
-"""End of a source of intrinsics that are known from the name or layout of a data set."""
+"""End of the source of intrinsics known by name or layout."""
 
 
 def by_name(name: str, values: dict[str, float]) -> Intrinsics:
@@ -97,7 +94,7 @@ def by_name(name: str, values: dict[str, float]) -> Intrinsics:
 
 
 def given(camera: Camera | str) -> Intrinsics:
-    """Intrinsics that the user gives: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``."""
+    """The user's intrinsics: a Camera, or ``fx,fy,cx,cy[,w,h[,depth_scale]]``."""
     if isinstance(camera, Camera):
         return from_camera(camera)
     try:
@@ -141,7 +138,7 @@ def from_file(path: Path) -> Intrinsics:
 
 
 def from_matrix(numbers: NDArray[np.float64], path: Path) -> Intrinsics:
-    """Intrinsics of the numbers of a file: a 3x3 or 4x4 matrix row by row, or ``fx fy cx cy [w h [depth_scale]]``."""
+    """Intrinsics of a 3x3 or 4x4 matrix by rows, or ``fx fy cx cy [w h [depth_scale]]``."""
     source = str(path)
     if numbers.size in (4, 6, 7):
         return Intrinsics(camera_values(*numbers.tolist()), source)
@@ -194,13 +191,13 @@ def _is_number(text: str) -> bool:
 
 
 BROWN, RATIONAL, FISHEYE = "plumb_bob", "rational_polynomial", "equidistant"
-"""Distortion models by their names in ROS. Brown-Conrady and its rational extension (Brown 1971) are as in OpenCV;
-the angle polynomial is by Kannala and Brandt (2006)."""
+"""Distortion models in ROS: Brown-Conrady, its rational extension (Brown 1971; OpenCV), angle polynomial (Kannala and
+Brandt 2006)."""
 INVERSE = "inverse_brown_conrady"
-"""Brown's polynomial from distorted to undistorted coordinates, which RealSense uses for colour."""
+"""Brown's polynomial from distorted to undistorted, for RealSense colour."""
 OTHER_NAMES = {"brown_conrady": BROWN, "modified_brown_conrady": BROWN, "kannala_brandt4": FISHEYE, "": BROWN}
 GRID = 24
-"""Points across and down the image to which an inverse model is fitted."""
+"""Points across and down for fitting an inverse model."""
 
 
 @dataclass(frozen=True)
@@ -208,9 +205,9 @@ class Lens:
     """Camera of recorded images.
 
     Attributes:
-        camera: Camera of the images after ``rectify``.
-        model: Model of the distortion that ``rectify`` removes, empty if it does nothing.
-        coefficients: Of this model, in the order of OpenCV.
+        camera: After ``rectify``.
+        model: Removed by ``rectify``, empty for none.
+        coefficients: In OpenCV's order.
     """
 
     camera: Camera
@@ -219,7 +216,7 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera, model: str, coefficients: "tuple[float, ...]") -> "Lens":
-        """Lens with up to five Brown coefficients in the camera itself; others are removed when images are read.
+        """Lens with up to five Brown coefficients in the camera; others are removed on reading.
 
         Raises:
             DatasetError: The model is not known.
@@ -240,7 +237,7 @@ class Lens:
         )
 
     def rectify(self, image: NDArray[Any], *, depth: bool) -> NDArray[Any]:
-        """Undistorted image (H, W[, C]) with the same intrinsics; depth is not interpolated."""
+        """Undistorted image (H, W[, C]); depth is not interpolated."""
         import cv2
 
         if not self.model:
@@ -251,7 +248,6 @@ class Lens:
 
     @cached_property
     def _pixels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Recorded pixel coordinates (H, W) of every undistorted pixel."""
         import cv2
 
         size, D = (self.camera.width, self.camera.height), np.array(self.coefficients)
@@ -264,11 +260,8 @@ class Lens:
 
 
 def brown_of_inverse(camera: Camera, inverse: "tuple[float, ...]") -> tuple[float, ...]:
-    """Coefficients k1 k2 p1 p2 k3 of a lens whose inverse is Brown's polynomial with the given coefficients.
-
-    With undistorted coordinates u = d + B(d; inverse), the coefficients c solve u + B(u; c) = d by least squares over
-    the image.
-    """
+    """Coefficients k1 k2 p1 p2 k3 of a lens whose inverse is Brown's polynomial: u + B(u; c) = d by least squares over
+    the image, with u = d + B(d; inverse)."""
     us, vs = np.meshgrid(np.linspace(0, camera.width - 1, GRID), np.linspace(0, camera.height - 1, GRID))
     d = np.stack([(us.ravel() - camera.cx) / camera.fx, (vs.ravel() - camera.cy) / camera.fy])
     u = d + (_brown_terms(d) @ np.array(inverse[:5])).reshape(2, -1)
@@ -276,7 +269,7 @@ def brown_of_inverse(camera: Camera, inverse: "tuple[float, ...]") -> tuple[floa
 
 
 def _brown_terms(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (2 n, 5) of the displacements, first x then y, of points (2, n) by k1 k2 p1 p2 k3."""
+    """Derivatives (2 n, 5) of displacements, x then y, of points (2, n) by k1 k2 p1 p2 k3."""
     x, y = points
     r2 = x * x + y * y
     return np.concatenate(

@@ -1,4 +1,4 @@
-"""Folders of masks: assignment to frames by the name or the number of the image, or by time."""
+"""Folders of masks, assigned to frames by name, number or time."""
 
 import re
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ Images = Sequence[tuple[Path, Path]]
 
 
 class MaskFolder:
-    """Folder of masks (PNG, 255 = dynamic), assigned to frames by name, by number or by time.
+    """Folder of masks (PNG, 255 = dynamic).
 
-    ``000030.png``, ``30.png``, ``rgb_000030.png`` or ``frame-000030.mask.png`` belongs to the frame of colour image 30.
-    A time in any unit belongs to the nearest frame, at most 20 ms away.
+    ``000030.png``, ``30.png``, ``rgb_000030.png`` or ``frame-000030.mask.png`` belongs to colour image 30; a time to
+    the nearest frame, at most 20 ms away.
 
     Args:
         path: The folder.
-        timestamps: (N,) increasing timestamps of the frames, seconds.
-        camera: Camera of the frames; the masks must have its image size.
+        timestamps: (N,) increasing, seconds.
+        camera: Camera of the frames and masks.
 
     Attributes:
-        complete: Whether every frame has one, and every mask a frame.
+        complete: Whether frames and masks match one to one.
 
     Raises:
-        DatasetError: The folder does not exist, holds no mask, no mask belongs to a frame, or two belong to one.
+        DatasetError: No folder, no mask, none for a frame, or two for one.
     """
 
     def __init__(self, path: str | Path, timestamps: NDArray[np.float64], camera: Camera, images: Images = ()) -> None:
@@ -59,11 +59,11 @@ class MaskFolder:
             self.said += f"; {len(masks) - len(self._files)} of {len(masks)} masks belong to no frame"
 
     def __getitem__(self, index: int) -> NDArray[np.bool_] | None:
-        """Mask (H, W) of a frame, or None if it has none.
+        """Mask (H, W) of a frame, or None.
 
         Raises:
             FrameError: The image cannot be decoded.
-            DatasetError: The image does not have the size of the frames.
+            DatasetError: The image has another size.
         """
         file = self._files.get(index)
         if file is None:
@@ -82,19 +82,18 @@ class MaskFolder:
 
 
 def stamped_masks(folder: Path) -> list[tuple[float, Path]]:
-    """Timestamps in seconds and paths of the PNG files of a folder that are named by a time, or by a number."""
+    """Timestamps in seconds and paths of PNG files named by a time or number."""
     named = [(name, path) for path in sorted(folder.glob("*.png")) if (name := _core(path)) and _is_time(name)]
     unit = time_unit([float(name) for name, _ in named])
     return [(float(name) / unit.per_second, path) for name, path in named]
 
 
 def are_counts(masks: Sequence[Path]) -> bool:
-    """Whether masks are named by small whole numbers, which are frame numbers and no times."""
+    """Whether names are small whole numbers, which are no times."""
     return bool(masks) and all(_is_count(_core(mask)) for mask in masks)
 
 
 def _of_one_form(files: list[Path]) -> list[Path]:
-    """Files with the most frequent form of name, first with the word mask."""
     forms: dict[str, list[Path]] = {}
     for file in files:
         forms.setdefault(re.sub(NUMBER, "N", file.stem), []).append(file)
@@ -114,7 +113,6 @@ def _is_count(name: str) -> bool:
 
 
 def _by_name(masks: list[Path], images: Images) -> dict[int, Path]:
-    """Masks by frame number: the colour or depth image has the same name or number."""
     found: dict[int, Path] = {}
     sides = list(zip(*images, strict=True))
     names = [{_core(file): index for index, file in enumerate(side)} for side in sides]
@@ -149,7 +147,6 @@ def _numbers(files: Sequence[Path]) -> dict[int, int]:
 def _by_time(
     path: Path, masks: list[Path], timestamps: NDArray[np.float64], taken: dict[int, Path], images: Images
 ) -> dict[int, Path]:
-    """Masks named by a time, by frame number; ``taken`` frames already have one."""
     counts = [mask for mask in masks if _is_count(_core(mask))]
     stamps = {float(_core(mask)): mask for mask in masks if mask not in counts and _is_time(_core(mask))}
     times = np.array(sorted(stamps))

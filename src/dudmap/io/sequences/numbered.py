@@ -1,4 +1,4 @@
-"""Numbered colour and depth images in any plain folder: exports of ZED, RealSense, Azure Kinect, your own camera."""
+"""Numbered images in any plain folder: exports of ZED, RealSense, Azure Kinect, your own camera."""
 
 import re
 from functools import cached_property
@@ -24,18 +24,16 @@ POSES = ("poses.txt", "pose.txt", "poses", "pose")
 
 
 class NumberedSequence(ImageFolder):
-    """Folder of numbered images, in two folders (``color/000001.png``, ``depth/000001.png``) or in one.
+    """Numbered images in two folders (``color/000001.png``, ``depth/000001.png``) or one, told apart by words, content,
+    or patterns (``image_series``). Equal numbers pair, 30 frames a second; numbers above 10^8 are times, within 20 ms.
 
-    Words in names, the content, or two patterns tell which images are depth and colour (``image_series``). Equal
-    numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms. The ground truth is
-    groundtruth.txt, or matrices camera to world. These are one per frame in poses.txt, or numbered like the images in a
-    folder ``pose`` or ``poses``.
+    The ground truth is groundtruth.txt, or matrices camera to world in poses.txt or a folder ``pose`` or ``poses``.
 
     Args:
-        color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, for ambiguous names.
+        color, depth: Patterns such as ``frames/*.jpg``, for ambiguous names.
 
     Raises:
-        DatasetError: As for ``ImageFolder``; or no numbered image matches a pattern, or the ground truth is malformed.
+        DatasetError: As for ``ImageFolder``; or a pattern matches nothing, or the ground truth is malformed.
     """
 
     format = "numbered images"
@@ -49,7 +47,7 @@ class NumberedSequence(ImageFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a folder holds depth and colour images by the words of their names."""
+        """Whether a folder holds depth and colour by words of names."""
         return path.is_dir() and all(image_series.by_names(path).values())
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
@@ -103,14 +101,14 @@ def _timed(files: dict[float, Path]) -> list[TimedFile]:
 
 BOP_FILE = "scene_camera.json"
 LARGEST_CHANGE = 0.5
-"""Largest difference of the intrinsics of two images, pixels: no image edge shifts by a pixel."""
+"""Largest difference of two images' intrinsics, pixels."""
 
 
 class BopSequence(NumberedSequence):
     """Scene of BOP (Hodan et al. 2018): rgb/, depth/ and scene_camera.json.
 
-    The file holds ``cam_K`` by image number and ``depth_scale``, millimetres per unit. The optional ``cam_R_w2c`` (row
-    by row) and ``cam_t_w2c`` (mm), world to camera, are the ground truth (bop_toolkit, docs/bop_datasets_format.md).
+    It holds ``cam_K`` by image number and ``depth_scale``, millimetres per unit. Optional ``cam_R_w2c`` (by rows) and
+    ``cam_t_w2c`` (mm), world to camera, are the ground truth (bop_toolkit, docs/bop_datasets_format.md).
     """
 
     format = "BOP"

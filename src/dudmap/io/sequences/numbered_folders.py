@@ -21,9 +21,9 @@ from dudmap.io.sequences.pose_matrices import read_log, read_matrix, read_upper_
 
 
 class EpflSequence(ImageFolder):
-    """Folder of the EPFL RGB-D Pedestrian data set (Bagautdinov et al. 2015) with the images of a Kinect v2 at rest.
+    """EPFL RGB-D Pedestrian data set (Bagautdinov et al. 2015): a Kinect v2 at rest.
 
-    ``rgb000033.png`` and ``depth000033.png`` (mm), with one published camera; colour is mapped to depth.
+    ``rgb000033.png`` and ``depth000033.png`` (mm), registered, with one published camera.
     """
 
     format = "EPFL RGB-D Pedestrian"
@@ -34,10 +34,9 @@ class EpflSequence(ImageFolder):
 
 
 class ReplicaSequence(ImageFolder):
-    """Folder of Replica as rendered for NICE-SLAM (Zhu et al. 2022): ``results/frame000000.jpg``, ``depth000000.png``.
+    """Replica as rendered for NICE-SLAM (Zhu et al. 2022): ``results/frame000000.jpg``, ``depth000000.png``.
 
-    ``traj.txt`` has one pose per line, 16 numbers, camera to world, x right, y down. Without cam_params.json in the
-    folder or its parent the camera of these renderings is used.
+    ``traj.txt`` has 16 numbers per line, camera to world. The camera is cam_params.json's, or published.
     """
 
     format = "Replica (NICE-SLAM)"
@@ -49,11 +48,9 @@ class ReplicaSequence(ImageFolder):
 
 
 class ScanNetSequence(ImageFolder):
-    """Folder of ScanNet (Dai et al. 2017) as its SensReader exports it: color, depth (mm), pose and intrinsic.
-
-    Colour and depth have separate intrinsics (4x4 matrices). Extrinsics E map the points of a camera to a common frame:
-    ``T_color_depth = E_color^-1 E_depth``. Frames with an infinite pose have no ground truth.
-    """
+    """ScanNet (Dai et al. 2017) as exported by SensReader: color, depth (mm), pose and intrinsic (4x4 each);
+    ``T_color_depth = E_color^-1 E_depth`` from extrinsics to a common frame. Frames with an infinite pose have no
+    ground truth."""
 
     format = "ScanNet export"
     color_files, pose_files = ("color", r"(\d+)\.(?:jpe?g|png)"), ("pose", r"(\d+)\.txt")
@@ -85,7 +82,6 @@ class ScanNetSequence(ImageFolder):
 
 
 def _parameter(path: Path, name: str) -> Path | None:
-    """File of the folder ``intrinsic``, or under the name of the 25k subset."""
     places = (path / "intrinsic" / name, path / name, path / name.replace("intrinsic_", "intrinsics_"))
     return next((place for place in places if place.is_file()), None)
 
@@ -93,7 +89,7 @@ def _parameter(path: Path, name: str) -> Path | None:
 SEVEN_SCENES_DEPTH = camera_values(585, 585, 320, 240, 640, 480)
 """Depth camera given on the 7-Scenes page."""
 SEVEN_SCENES_COLOR = camera_values(525, 525, 320, 240, 640, 480)
-"""Colour camera used for 7-Scenes (DSAC*, Brachmann and Rother 2021); the page gives none."""
+"""Colour camera for 7-Scenes (DSAC*, Brachmann and Rother 2021)."""
 KINECT_COLOR_DEPTH = np.array(
     [
         [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03, -2.5558943178152542e-02],
@@ -102,26 +98,25 @@ KINECT_COLOR_DEPTH = np.array(
         [0, 0, 0, 1],
     ]
 )
-"""Motion of points of a Kinect's depth camera into its colour camera (LIRIS), used by DSAC* for 7-Scenes and
-confirmed by ``dudmap calibrate`` on 200 frames."""
+"""Motion from a Kinect's depth to colour camera (LIRIS), as in DSAC* for 7-Scenes, confirmed by ``dudmap
+calibrate``."""
 SEVEN_SCENES = r"(7|seven)[-_ ]?scenes|/(chess|fire|heads|office|pumpkin|red_?kitchen|stairs)/seq-\d+$"
-"""Path of a recording of 7-Scenes: the name of the set, or of one of its scenes above ``seq-01``."""
+"""Path of 7-Scenes: the set, or a scene above ``seq-01``."""
 LOST = 65535
 
 
 class FrameFiles(ImageFolder):
-    """Base of the formats with files named ``frame-000000``; poses are camera to world, one file per frame."""
+    """Base of the formats with files ``frame-000000``; poses are camera to world."""
 
     color_files = "", r"frame-(\d+)\.(?:color|rgb)\.(?:png|jpe?g)"
     depth_files, pose_files = ("", r"frame-(\d+)\.depth\.(?:png|pgm)"), ("", r"frame-(\d+)\.pose\.txt")
 
 
 class SharedFrameFiles(FrameFiles):
-    """Folder of such images with pose files: 7-Scenes (Shotton et al. 2013), 3DMatch, tsdf-fusion and others.
+    """Such images with pose files: 7-Scenes (Shotton et al. 2013), 3DMatch, tsdf-fusion and others.
 
-    Intrinsics are in the folder or its parent, and colour is registered to depth; 65535 means missing. A path that
-    names 7-Scenes has the cameras of that data set: colour is not registered, and camera-intrinsics.txt is the depth
-    camera. Registered copies need an intrinsics.txt.
+    Intrinsics are in the folder or its parent; colour is registered; 65535 means missing. A path that names 7-Scenes
+    has its cameras, not registered; registered copies need an intrinsics.txt.
     """
 
     format = "7-Scenes, 3DMatch or tsdf-fusion"
@@ -151,11 +146,8 @@ class SharedFrameFiles(FrameFiles):
 
 
 class VolumeDeformSequence(FrameFiles):
-    """Folder of VolumeDeform (Innmann et al. 2016): images with colorIntrinsics.txt and depthIntrinsics.txt.
-
-    It is the folder of the images (``data``) or its parent, in which poses.txt may hold a 4x4 matrix per frame. Equal
-    matrices mean registered images; otherwise both cameras are assumed to be in one place.
-    """
+    """VolumeDeform (Innmann et al. 2016): images (``data``) with colorIntrinsics.txt and depthIntrinsics.txt, and
+    poses.txt with a 4x4 matrix per frame above."""
 
     format = "VolumeDeform"
     layout = ("depthIntrinsics.txt", "frame-*.depth.*")
@@ -170,7 +162,7 @@ class VolumeDeformSequence(FrameFiles):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a folder has this layout, or its folder ``data``."""
+        """Whether a folder, or its ``data``, has this layout."""
         return super().recognises(path) or super().recognises(path / "data")
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
@@ -188,17 +180,17 @@ class VolumeDeformSequence(FrameFiles):
 
 
 REDWOOD_NAMES = r"redwood|/(burghers|cactusgarden|copyroom|lounge|readingroom|stonewall|totempole)(_png)?$"
-"""Path of a recording of these data sets; object scans are recognised by their file names."""
+"""Path of these data sets; object scans are recognised by file names."""
 COLORS = ("color", "rgb", "image", "image_2d")
 OBJECT_SCAN = r"(\d{7})-\d{12}\.(?:jpe?g|png)"
-"""File names of the Redwood object scans: frame number and microseconds."""
+"""Redwood object scans: frame number and microseconds."""
 
 
 class RedwoodSequence(ImageFolder):
-    """Folder with ``color`` (or rgb, image), ``depth`` (mm) and a ``*.log`` inside or next to it, or an object scan.
+    """``color`` (or rgb, image), ``depth`` (mm) and a ``*.log`` inside or next to it, or an object scan.
 
-    A ``.log`` holds camera-to-world matrices by frame number, counted from the first image. ``scene/trajectory.log`` is
-    Open3D's own estimate and no ground truth. Intrinsics come from a JSON file of Open3D, or are known.
+    A ``.log`` holds camera-to-world matrices by frame number; ``scene/trajectory.log`` is Open3D's estimate and no
+    ground truth. Intrinsics come from Open3D's JSON file, or are known.
     """
 
     format = "Redwood or Open3D"
@@ -243,27 +235,26 @@ def _color_folder(path: Path) -> Path | None:
 
 
 def _logs(path: Path) -> list[Path]:
-    """Trajectories in a folder or next to it: ``copyroom_trajectory.log`` for ``copyroom_png``."""
     name = path.resolve().name.removesuffix("_png")
     inside = sorted(path.glob("*traj*.log")) or sorted(path.glob("*.log"))
     return inside or sorted(path.resolve().parent.glob(f"{name}[_-]traj*.log"))
 
 
 ICL_NUIM = camera_values(481.2, 480, 319.5, 239.5, 640, 480, 5000)
-"""Published camera of ICL-NUIM; its fy is -480 because the renderer's y axis points up."""
+"""Published camera of ICL-NUIM; its fy is negative because y points up."""
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
-"""Motion between the renderer's left-handed axes (y up) and dudmap's (y down), for world and camera alike."""
+"""Between the renderer's left-handed axes (y up) and dudmap's, for world and camera."""
 MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
-"""Between the renderer's axes and the axes of the published model of the living room."""
+"""Between the renderer's axes and the living room model's."""
 NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 SCENE_FILE = r"scene_\d+_(\d+)"
 
 
 class IclNuimSequence(ImageFolder):
-    """Folder of ICL-NUIM (Handa et al. 2014) with ``rgb/N.png``, ``depth/N.png`` and perhaps a ``*.gt.freiburg``.
+    """ICL-NUIM (Handa et al. 2014): ``rgb/N.png``, ``depth/N.png`` and perhaps a ``*.gt.freiburg``.
 
-    Published poses T use the renderer's left-handed axes: ``M T M`` with M = diag(1, -1, 1) fits the images with a
-    positive fy. The first frames have no pose.
+    Published poses T are left-handed: ``M T M`` with M = diag(1, -1, 1) fits a positive fy. The first frames have no
+    pose.
     """
 
     format = "ICL-NUIM"
@@ -275,7 +266,7 @@ class IclNuimSequence(ImageFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a folder has this layout: the images, and the name of the data set on it or on its ground truth."""
+        """Whether a folder has this layout and the data set's name."""
         if not super().recognises(path) or not numbered_files((path / "depth").iterdir(), r"(\d+)\.png"):
             return False
         named = re.search(r"(living|office)_?room|traj\d+n?_(frei|loop)", path.resolve().name, re.IGNORECASE)
@@ -286,11 +277,10 @@ class IclNuimSequence(ImageFolder):
 
     @property
     def model(self) -> "PlacedModel | None":
-        """The published model of the living room in the world of the ground truth; None without its file.
+        """The published living room in the world of the ground truth; None without its file.
 
-        The model (living-room.ply or .obj), in the folder or the one above, has the axes of the renderer with x
-        mirrored. ``*.gt.sim`` (three rows of four numbers per frame) has poses in them, a row of ``*.gt.freiburg`` for
-        each. The first pose of both places the model.
+        living-room.ply or .obj, in the folder or above, has the renderer's axes with x mirrored. ``*.gt.sim`` (three
+        rows per frame) has poses in them for each row of ``*.gt.freiburg``; the first places the model.
 
         Raises:
             DatasetError: A pose that places the model is missing.
@@ -311,17 +301,17 @@ class IclNuimSequence(ImageFolder):
 
 
 class PlacedModel(NamedTuple):
-    """Mesh file of a true surface, and its pose (4, 4) in the world of the ground truth."""
+    """Mesh file of a true surface, and its pose (4, 4) in the ground truth's world."""
 
     path: Path
     T_world_model: NDArray[np.float64]
 
 
 class IclNuimLoopSequence(ImageFolder):
-    """Folder with ``scene_00_0000.png``, ``.depth`` and ``.txt``: the renderer's own layout.
+    """The renderer's layout: ``scene_00_0000.png``, ``.depth`` and ``.txt``.
 
-    A ``.depth`` file is text: the distance along the ray of every pixel, metres, row by row. A ``.txt`` file gives
-    position, direction and right vector of the camera, left-handed with y up.
+    A ``.depth`` file has the distance along the ray of every pixel, metres, by rows. A ``.txt`` file has position,
+    direction and right vector, left-handed, y up.
     """
 
     format = "ICL-NUIM"
@@ -352,8 +342,8 @@ class IclNuimLoopSequence(ImageFolder):
 
 
 def _freiburg(folder: Path) -> Trajectory | None:
-    """Poses of groundtruth.txt, else of the only ``*.gt.freiburg`` (``number tx ty tz qx qy qz qw``), in dudmap's
-    axes and seconds; real times must not be read as numbers."""
+    """Poses of groundtruth.txt or the only ``*.gt.freiburg`` (``number tx ty tz qx qy qz qw``), in dudmap's axes and
+    seconds."""
     found = [folder / "groundtruth.txt"]
     found = found if found[0].is_file() else list(folder.glob("*.gt.freiburg"))
     if len(found) != 1:

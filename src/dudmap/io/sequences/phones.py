@@ -1,7 +1,7 @@
-"""Recordings of phone applications: Stray Scanner, ARKitScenes, Polycam, exports of Record3D, nerfstudio's form.
+"""Phone recordings: Stray Scanner, ARKitScenes, Polycam, Record3D, nerfstudio's form.
 
-ARKit gives depth of 256x192 pixels in the view of the colour image, and a confidence of every pixel. Pixels of
-confidence 0, the lowest, are omitted, as Polycam's documentation advises.
+ARKit's depth has 256x192 pixels in the view of colour; pixels of confidence 0 are omitted. Pixels of confidence 0, the
+lowest, are omitted, as Polycam's documentation advises.
 """
 
 import math
@@ -28,7 +28,7 @@ from dudmap.io.sequences.pose_matrices import OPENGL_AXES, read_matrix, rigid_tr
 from dudmap.io.sequences.video import Video
 
 Y_UP, Z_UP = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-"""Directions against gravity in worlds of ARKit, and in worlds that were turned later."""
+"""Up in worlds of ARKit, and in worlds turned later."""
 
 
 def _rotations(poses: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:
@@ -36,7 +36,7 @@ def _rotations(poses: Trajectory) -> list[tuple[float, NDArray[np.float64]]]:
 
 
 class ArkitFolder(ImageFolder):
-    """Base of the formats; ``confidence`` is next to the folder of depth images and has their file names."""
+    """Base of the formats; ``confidence`` has the depth images' file names."""
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         depth = images.read_depth(path, depth_scale)
@@ -50,10 +50,10 @@ class ArkitFolder(ImageFolder):
 
 
 class StrayScannerSequence(ArkitFolder):
-    """Folder of the application Stray Scanner: a video of the colour images, and depth images by frame number.
+    """Stray Scanner: a colour video, and depth images by frame number.
 
     Layout: https://github.com/strayrobots/scanner/blob/main/docs/format.md. ``rgb.mp4``, ``depth/000000.png`` (mm),
-    ``confidence/000000.png``, ``camera_matrix.csv`` (3x3) and ``odometry.csv`` with the times; its poses are no ground
+    ``confidence/000000.png``, ``camera_matrix.csv`` (3x3) and ``odometry.csv`` with times; its poses are no ground
     truth.
     """
 
@@ -83,7 +83,7 @@ class StrayScannerSequence(ArkitFolder):
 
     @cached_property
     def gravity(self) -> Gravity | None:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The world of the odometry has y up; its poses have dudmap's camera axes."""
+        """The world has y up; poses have dudmap's camera axes."""
         file = self.path / "odometry.csv"
         header, *rows = (line.replace(" ", "").split(",") for line in read_text(file).splitlines() if line.strip())
         if not {"qx", "qy", "qz", "qw"} <= set(header):
@@ -105,11 +105,10 @@ class StrayScannerSequence(ArkitFolder):
 
 
 class ArkitScenesSequence(ArkitFolder):
-    """Video of ARKitScenes (Baruch et al. 2021), raw or 3dod: images of 256x192 pixels with times in their names.
+    """ARKitScenes (Baruch et al. 2021), raw or 3dod: 256x192 pixels, times in names.
 
     Layout: https://github.com/apple/ARKitScenes/blob/main/DATA.md. ``lowres_wide/ID_TIME.png``, ``lowres_depth``,
-    ``confidence``, ``lowres_wide_intrinsics/ID_TIME.pincam`` (the median is used) and ``lowres_wide.traj``, world to
-    camera.
+    ``confidence``, ``lowres_wide_intrinsics/ID_TIME.pincam`` (median) and ``lowres_wide.traj``, world to camera.
     """
 
     format = "ARKitScenes"
@@ -152,12 +151,11 @@ class ArkitScenesSequence(ArkitFolder):
 
 
 class PolycamSequence(ArkitFolder):
-    """Raw data of the application Polycam: keyframes with a time in microseconds as name.
+    """Polycam: keyframes named by microseconds.
 
-    Layout: https://github.com/PolyCam/polyform#polycams-data-format. ``keyframes`` holds ``images/TIME.jpg``,
-    ``cameras/TIME.json``, ``depth/TIME.png`` (mm) and ``confidence/TIME.png``. ``corrected_images`` and
-    ``corrected_cameras``, if they exist, replace them; these cameras, optimised over all images, are the ground truth.
-    Intrinsics are the median.
+    Layout: https://github.com/PolyCam/polyform#polycams-data-format. ``keyframes``: ``images/TIME.jpg``,
+    ``cameras/TIME.json``, ``depth/TIME.png`` (mm), ``confidence/TIME.png``. ``corrected_images`` and
+    ``corrected_cameras`` replace them; these optimised cameras are the ground truth. Intrinsics are the median.
     """
 
     format = "Polycam"
@@ -169,7 +167,7 @@ class PolycamSequence(ArkitFolder):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a folder has this layout, or is the ``keyframes`` of one that has it."""
+        """Whether a folder, or the one above ``keyframes``, has this layout."""
         return any(
             (place / "depth").is_dir() and any(place.glob("*images")) and any(place.glob("*cameras/*.json"))
             for place in (path / "keyframes", path)
@@ -215,10 +213,9 @@ class PolycamSequence(ArkitFolder):
 
 
 class Record3DFolder(ImageFolder):
-    """Export of the application Record3D in images: ``rgb/N.jpg``, ``depth/N.exr`` (float metres) and metadata.json.
+    """Record3D in images: ``rgb/N.jpg``, ``depth/N.exr`` (float metres) and metadata.json with K by columns and times;
 
-    The metadata hold K of the colour images, column by column, and the times; ARKit's poses are no ground truth. Depth
-    shows the view of the colour images and is smaller.
+    ARKit's poses are no ground truth. Depth has the view of colour and is smaller.
     """
 
     format = "Record3D images"
@@ -242,7 +239,7 @@ class Record3DFolder(ImageFolder):
 
 
 def record3d_times(tree: dict[str, Any], numbers: list[int], source: Path) -> list[float]:
-    """Times in seconds of the frames with these numbers from Record3D's metadata.
+    """Times in seconds of these frames from Record3D's metadata.
 
     Raises:
         DatasetError: They do not increase.
@@ -258,12 +255,11 @@ MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "")
 
 
 class NerfstudioSequence(ImageFolder):
-    """Folder in nerfstudio's form: transforms.json names ``file_path``, ``depth_file_path`` and ``transform_matrix``.
+    """nerfstudio's form: transforms.json names ``file_path``, ``depth_file_path`` and ``transform_matrix``.
 
-    Frames are ordered by image name, at 30 Hz, unless each has a ``timestamp``. Depth has 16 bits,
-    ``depth_unit_scale_factor`` (default 0.001) metres per unit, or is float metres in a .npy file. It has the view of
-    the colour image, often smaller. Intrinsics are the median. Matrices are camera to world with OpenGL axes. Poses of
-    structure from motion are no ground truth: they lack scale.
+    Frames are ordered by name, at 30 Hz unless each has a ``timestamp``. Depth has 16 bits, ``depth_unit_scale_factor``
+    (default 0.001) metres per unit, or is a .npy file of metres, in the view of colour. Intrinsics are the median;
+    matrices are camera to world with OpenGL axes; poses without scale are no ground truth.
     """
 
     format = "nerfstudio"

@@ -1,6 +1,6 @@
 """Files of camera poses as 4x4 matrices.
 
-A file that cannot be read or holds something else raises a ``DatasetError``.
+Damaged files raise a ``DatasetError``.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,7 @@ OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float64]:
-    """Matrix (rows, columns) of a text file; commas count as blanks. Numbers need not be finite."""
+    """Matrix (rows, columns) of a text file; numbers need not be finite."""
     numbers = _numbers(path)
     if numbers.size != rows * columns:
         raise DatasetError(f"{path} holds {numbers.size} numbers; expected a {rows}x{columns} matrix")
@@ -55,8 +55,8 @@ def read_upper_rows(path: Path) -> NDArray[np.float64]:
 
 
 def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
-    """Poses by frame number of a ``.log`` file (Redwood, Open3D): three integers, the first the frame number, then
-    four rows of T_world_camera."""
+    """Poses by frame number of a ``.log`` file (Redwood, Open3D): three integers, the first the number, then
+    T_world_camera by rows."""
     numbers = _numbers(path)
     if numbers.size == 0 or numbers.size % 19:
         raise DatasetError(f"{path} holds {numbers.size} numbers; expected 3 integers and a 4x4 matrix for every pose")
@@ -65,8 +65,8 @@ def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
 
 
 def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Trajectory | None:
-    """Trajectory of (timestamp, T_world_camera) pairs; poses that are not rigid (infinite or zero) are omitted,
-    rotations projected onto the nearest one. None without poses."""
+    """Trajectory of (timestamp, T_world_camera) pairs; poses that are not rigid are omitted, rotations projected. None
+    without poses."""
     kept = []
     for stamp, T in poses:
         R = T[:3, :3]

@@ -1,7 +1,7 @@
-"""Depth images whose 16-bit millimetres are rotated left by three bits, as SUN3D (Xiao et al. 2013) stores them.
+"""Depth of 16-bit millimetres rotated left by three bits, as in SUN3D (Xiao et al. 2013), SUN RGB-D and the Amazon
+Picking Challenge.
 
-``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, and small numbers beyond. Also SUN RGB-D and the
-Amazon Picking Challenge. Values in units of 1/8 mm are read the same.
+``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, small numbers beyond; units of 1/8 mm read the same.
 """
 
 from collections.abc import Callable
@@ -15,27 +15,27 @@ from dudmap.errors import FrameError
 
 UNITS_PER_METRE = 8000.0
 LEAST_READINGS, LEAST_VALUES = 1000, 32
-"""Smallest number of measurements, and of different values, for a decision."""
+"""Fewest measurements, and different values, for a decision."""
 MOST = 0.95
-"""Smallest share of the measurements with a property of the images."""
+"""Smallest share of measurements with a property."""
 NEAR_SHARE = 0.8
-"""Smallest share of measurements below 8.19 m; their low three bits are 0."""
+"""Smallest share below 8.19 m, with low three bits of 0."""
 FARTHEST = 10000
-"""Largest distance that depth cameras for rooms measure, mm. Values with low bits must decode to nearer distances;
-low bits that number persons (Microsoft's first driver) do not. A unit is wrong if a twentieth is beyond."""
+"""Largest distance of depth cameras for rooms, mm; low bits may also number persons. A unit is wrong if a twentieth is
+beyond."""
 FACTORS = (2, 3, 5, 7, 11, 13)
-"""If all millimetres are multiples of one of these factors, the images have another unit."""
+"""Common factors of all millimetres that mean another unit."""
 PLAUSIBLE = (256, 8000)
-"""Range of the median distance, mm: from 8-bit depth times 8 to the limit of a camera for rooms."""
+"""Range of the median distance, mm."""
 DENSE = 0.9
-"""Largest share of the millimetres in a range that occur in rotated depth. Steps of a camera grow with distance,
-steps of a unit are constant."""
+"""Largest share of the millimetres in a range that occur in rotated depth, because steps of a camera grow with
+distance."""
 SAMPLED = 5
 SAID = "the depth values are multiples of 8, as are millimetres rotated left by three bits (SUN3D)"
 
 
 class Rotated(Enum):
-    """Whether depth images are rotated. Both interpretations may be distances in a room; a file may give the unit."""
+    """Whether depth images are rotated; if both may be, a file may give the unit."""
 
     NO = ""
     POSSIBLY = f"{SAID}; if distances come out eight times too large, give --depth-unit 0.000125"
@@ -57,9 +57,9 @@ def judge(count: int, read: Callable[[int], NDArray[np.floating]], units_per_met
     """Whether the 16-bit values of the depth images of a recording are rotated.
 
     Args:
-        read: Returns the stored values of an image by number, 0 for no measurement. Fractions exclude 16-bit values.
-        units_per_metre: Unit of the values if they are not rotated.
-        given: Whether a file or the user gives that number.
+        read: Returns stored values by image number, 0 = none; fractions exclude 16-bit values.
+        units_per_metre: Unit if not rotated.
+        given: Whether a file or the user gives it.
     """
     images = []
     for index in np.unique(np.linspace(0, count - 1, SAMPLED).astype(int)).tolist():

@@ -1,4 +1,4 @@
-"""Folders with lists of stamped images: the TUM RGB-D benchmark (Sturm et al. 2012) and similar data sets."""
+"""Folders with lists of stamped images: TUM RGB-D benchmark (Sturm et al. 2012) and similar."""
 
 import re
 from dataclasses import replace
@@ -22,16 +22,14 @@ from dudmap.io.sequences.intrinsics import camera_values
 
 
 class TumSequence(ImageFolder):
-    """Recording with rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
+    """rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
 
-    Without rgb.txt and a folder rgb/ it is a recording of depth alone. associations.txt (``t_rgb rgb_file t_depth
-    depth_file``) pairs images; else they pair one to one, nearest first, at most 20 ms apart. The timestamp of a frame
-    is that of its depth image.
+    Without rgb.txt and rgb/ it is depth alone. associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs images;
+    else nearest first, at most 20 ms apart. Frames have the depth's timestamp.
 
-    Intrinsics come from ``camera``, else from a file, else from freiburg1-3 in the name of the folder, or of the bag in
-    rgb.txt (``# file: 'rgbd_dataset_freiburg1_xyz.bag'``). Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are applied
-    to both images. The published distortion of freiburg1 and 2 is not used. It describes the colour lens, but the
-    driver reprojected the depth for a lens without distortion.
+    Intrinsics: ``camera``, a file, or freiburg1-3 in the name of the folder or of the bag in rgb.txt. Coefficients in
+    intrinsics.txt (k1 k2 p1 p2 k3) apply to both images. The published distortion of freiburg1 and 2 is of the colour
+    lens; depth was reprojected without it.
     """
 
     format = "TUM RGB-D"
@@ -41,7 +39,7 @@ class TumSequence(ImageFolder):
         (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", camera_values(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
         (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", camera_values(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
     )
-    """Name pattern of the folder or bag, name, and published intrinsics of each camera."""
+    """Name pattern, name, and published intrinsics of each camera."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path, camera)
@@ -54,10 +52,10 @@ class TumSequence(ImageFolder):
         return (lists and (path / "depth.txt").is_file()) or (path / "associations.txt").is_file()
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame, None if mask.txt lists none.
+        """True dynamic mask (H, W), or None.
 
         Raises:
-            FrameError: The mask cannot be read or has another size than the recording.
+            FrameError: Unreadable or of another size.
         """
         path = self._masks.get(range(len(self))[index])
         if path is None:
@@ -90,7 +88,6 @@ class TumSequence(ImageFolder):
         return self._stamped_poses()
 
     def _find_masks(self) -> dict[int, Path]:
-        """Mask files by frame number; mask.txt has the timestamps of the colour images."""
         path = self.path / "mask.txt"
         if not path.is_file():
             return {}
@@ -102,7 +99,6 @@ class TumSequence(ImageFolder):
 
 
 def _bag_name(path: Path) -> str:
-    """Name of the bag in the header of a list of images; empty if there is none."""
     if not path.is_file():
         return ""
     for line in read_text(path).splitlines():
@@ -113,7 +109,7 @@ def _bag_name(path: Path) -> str:
 
 
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Axes of Bonn's motion capture system relative to the point cloud; its own inverse. From the data set's page."""
+"""Axes of Bonn's motion capture relative to the point cloud; its own inverse (page of the data set)."""
 T_MARKER_CAMERA = np.array(
     [
         [1.0157, 0.1828, -0.2389, 0.0113],
@@ -122,32 +118,31 @@ T_MARKER_CAMERA = np.array(
         [0, 0, 0, 1],
     ]
 )
-"""T_m of the data set's page: camera to markers. Its rotation is scaled by 1.0593, which is removed for poses."""
+"""T_m of the data set's page, camera to markers; its scale 1.0593 is removed."""
 
 
 BONN_NAME = re.compile("rgbd_bonn", re.IGNORECASE)
 
 
 def holds_bonn_markers(path: Path) -> bool:
-    """Whether true poses are a Bonn recording's as published, by the names of file and folder; files of dudmap have
-    a header."""
+    """Whether true poses are Bonn's as published, by names of file and folder."""
     inside = path.name == "groundtruth.txt" and BONN_NAME.search(path.resolve().parent.name)
     named = BONN_NAME.search(path.name) and re.search("gt|ground", path.name, re.IGNORECASE)
     return bool(inside or named) and path.is_file() and not read_text(path).startswith(TUM_HEADER)
 
 
 def bonn_camera_poses(Ts_marker: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Camera poses ``T_ROS^-1 T T_ROS T_m`` (N, 4, 4) of marker poses T, in the frame of the data set's point cloud."""
+    """Camera poses ``T_ROS^-1 T T_ROS T_m`` (N, 4, 4) of marker poses T, in the point cloud's frame."""
     T_marker_camera = T_MARKER_CAMERA.copy()
     T_marker_camera[:3, :3] = se3.nearest_rotation(T_MARKER_CAMERA[:3, :3])
     return T_ROS @ Ts_marker @ T_ROS @ T_marker_camera
 
 
 class BonnSequence(TumSequence):
-    """Folder ``rgbd_bonn_*`` of the Bonn RGB-D Dynamic Dataset (Palazzolo et al. 2019).
+    """``rgbd_bonn_*`` of the Bonn RGB-D Dynamic Dataset (Palazzolo et al. 2019).
 
-    groundtruth.txt holds poses of the markers. The ground truth holds camera poses (``bonn_camera_poses``), in the
-    frame of the point cloud ``rgbd_bonn_groundtruth_1mm_section.ply``.
+    Poses of the markers in groundtruth.txt become camera poses (``bonn_camera_poses``) in the frame of
+    ``rgbd_bonn_groundtruth_1mm_section.ply``.
     """
 
     format = "Bonn RGB-D Dynamic"
@@ -167,10 +162,9 @@ class BonnSequence(TumSequence):
 
 
 class CorbsSequence(TumSequence):
-    """Folder ``D1_pre_registereddata`` of CoRBS (Wasenmueller et al. 2016), whose lists may have backslashes.
+    """``D1_pre_registereddata`` of CoRBS (Wasenmueller et al. 2016); lists may have backslashes.
 
-    The ground truth is groundtruth.txt in the folder, or in the downloaded folder or archive ``D1_Trajectory`` next to
-    it.
+    The ground truth is groundtruth.txt, or in the folder or archive ``D1_Trajectory`` next to it.
     """
 
     format = "CoRBS"
@@ -208,10 +202,9 @@ CAMERA_FRAME, BODY_FRAME = "d400_color_optical_frame", "base_link"
 
 
 class OpenLorisSequence(ImageFolder):
-    """Folder of OpenLORIS-Scene (Shi et al. 2020) in the "package" form: a RealSense D435i on a robot.
+    """OpenLORIS-Scene (Shi et al. 2020), "package" form: a RealSense D435i on a robot.
 
-    Intrinsics in sensors.yaml are in the order fx, cx, fy, cy. groundtruth.txt holds poses of ``base_link``; camera
-    poses follow from trans_matrix.yaml.
+    sensors.yaml has fx, cx, fy, cy; groundtruth.txt poses of ``base_link``, camera poses follow from trans_matrix.yaml.
     """
 
     format = "OpenLORIS-Scene"
@@ -247,7 +240,6 @@ def _matrix(node: Any, key: str) -> NDArray[np.float64] | None:  # noqa: ANN401 
 
 
 def _motion(path: Path, parent: str, child: str) -> NDArray[np.float64]:
-    """T_parent_child (4, 4) along the tree of the file, whose matrices map points of a child to its parent."""
     entries = read_yaml(path).get("trans_matrix")
     edges: dict[str, dict[str, NDArray[np.float64]]] = {}
     for index, node in enumerate(entries if isinstance(entries, list) else []):

@@ -1,7 +1,6 @@
-"""Bags that were not closed: the recorder was killed, the power failed, or a copy was cut off.
+"""Bags that were not closed: killed recorder, power failure, cut copy.
 
-An MCAP file or ROS 1 bag has its index at the end. A new one is made from the complete chunks and read as if it
-followed them. Content that violates the format raises a ``ValueError``.
+A new index of the complete chunks follows the file, as at its end. Damage raises a ``ValueError``.
 """
 
 import io
@@ -16,11 +15,11 @@ from dudmap.input_files import open_plain
 
 
 class CompletedFile:
-    """The first bytes of a file followed by bytes in memory; rosbags uses it like a path.
+    """The first bytes of a file followed by bytes in memory, as a path for rosbags.
 
     Args:
-        length: Number of bytes of the file that are read.
-        head: Bytes that replace the first bytes of the file.
+        length: Bytes of the file.
+        head: Replaces the first bytes.
     """
 
     def __init__(self, path: Path, length: int, tail: bytes, head: bytes = b"") -> None:
@@ -82,7 +81,7 @@ class _Completed(io.RawIOBase):
 
 
 def completed(path: Path) -> CompletedFile | None:
-    """An MCAP file or ROS 1 bag with a new index, None for files of other formats.
+    """An MCAP file or ROS 1 bag with a new index, None for others.
 
     Raises:
         ValueError: It holds no complete chunk, or is damaged.
@@ -95,16 +94,16 @@ def completed(path: Path) -> CompletedFile | None:
 
 
 MCAP, BAG = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
-"""First bytes of an MCAP file (and its last bytes), and of a ROS 1 bag."""
+"""First bytes of an MCAP file (also its last), and of a ROS 1 bag."""
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, DATA_END = 2, 3, 4, 5, 6, 7, 8, 15
 """Operation codes of MCAP records (MCAP specification, section Records)."""
 LARGEST_CHUNK = 2**28
-"""Largest chunk or message of a bag after decompression, bytes: recorders write 4 MB, a raw image has 200 MB."""
+"""Largest unpacked chunk or message, bytes: recorders write 4 MB, a raw image has 200 MB."""
 
 
 @dataclass
 class _Chunk:
-    """A chunk of an MCAP file: its record, the head before its content, and the positions of its indexes by channel."""
+    """A chunk of an MCAP file: record, head, and indexes by channel."""
 
     start: int
     end: int
@@ -195,7 +194,6 @@ def _fits(chunk: _Chunk, length: int) -> bool:
 def _mcap_content(
     file: IO[bytes], chunk: _Chunk, known: dict[tuple[int, int], bytes]
 ) -> dict[int, list[tuple[int, int]]]:
-    """Times and positions of the messages in a chunk, by channel; adds its schemas and channels."""
     from rosbags.rosbag2 import storage_mcap
 
     start = chunk.start + 9 + len(chunk.head)
@@ -238,7 +236,7 @@ Entry = tuple[int, int, int]
 
 @dataclass
 class _BagChunk:
-    """A chunk of a ROS 1 bag: position and header of its record, position and size of its content, indexes by topic."""
+    """A chunk of a ROS 1 bag: record, content, indexes by topic."""
 
     start: int
     fields: Fields
@@ -319,7 +317,6 @@ def _bag_fields(data: bytes) -> Fields:
 def _bag_content(
     file: IO[bytes], chunk: _BagChunk, connections: dict[int, bytes]
 ) -> tuple[dict[int, list[Entry]], bytes]:
-    """Times and positions of the messages in a chunk by topic, and its content; adds its topics."""
     from rosbags.rosbag1.reader import decompressors
 
     packed, name = _read(file, chunk.content, chunk.length), chunk.fields["compression"].decode("ascii", "replace")

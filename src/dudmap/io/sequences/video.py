@@ -11,24 +11,23 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import open_plain
 
 MARK = b"ftyp"
-"""Bytes 4 to 8 of an MP4 file; without this check the decoder guesses, and playlists name other files."""
+"""Bytes 4 to 8 of an MP4 file: the decoder guesses, and playlists name other files."""
 
 
 EXACT = 1e-5
-"""Largest error of a frame number computed from a time."""
+"""Largest error of a frame number from a time."""
 FAR = 60
-"""Frames ahead up to which decoding all frames costs less than a search."""
+"""Frames ahead up to which decoding is cheaper than a search."""
 
 
 class Video:
     """Frames of an MP4 file by number.
 
-    Frames in increasing order are decoded one after the other. At a constant rate, the time of a frame gives its
-    number, and other frames are found by seeking. If the rate varies, or if seeking ends at another frame, all frames
-    are decoded from the beginning.
+    Increasing frames are decoded one after the other; others are found by seeking at a constant rate, else decoded from
+    the beginning.
 
     Raises:
-        DatasetError: The file is no MP4 video that can be decoded, or its frames are too large.
+        DatasetError: No decodable MP4 video, or too large frames.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,7 +54,6 @@ class Video:
         self._next = 0
 
     def _jump(self, index: int) -> None:
-        """Seek a distant frame, or restart at the beginning."""
         import cv2
 
         self._open()
@@ -75,7 +73,6 @@ class Video:
         return self._next_is(index)
 
     def _next_is(self, index: int) -> bool:
-        """Whether the time of the next frame matches this number at the mean rate."""
         import cv2
 
         rate = self._capture.get(cv2.CAP_PROP_FPS) / 1000
@@ -85,7 +82,7 @@ class Video:
         """Frame (H, W, 3), RGB.
 
         Raises:
-            FrameError: The video has fewer frames, or is damaged there.
+            FrameError: The video is shorter, or damaged there.
         """
         import cv2
 

@@ -1,4 +1,4 @@
-"""Bake a texture: atlas, colours of each texel from the best views, filled gaps."""
+"""Bake a texture: atlas, texel colours from the best views, filled gaps."""
 
 from dataclasses import dataclass, replace
 
@@ -18,22 +18,21 @@ from dudmap.io.exporting.view_synthesis import images_of
 from dudmap.io.texturing.views import Taken, View, Views, groups
 
 SIZES = 64, 8192
-"""Smallest and largest texture, pixels; one of 8192 takes 2 GB while it is made."""
+"""Smallest and largest texture, pixels; 8192 takes 2 GB."""
 TRIANGLES = 40_000
-"""Most triangles of a textured mesh by default: an atlas of as many takes ten seconds."""
+"""Triangles of a textured mesh by default: an atlas takes ten seconds."""
 PADDING = 3
-"""Texels around a chart that continue it, so that interpolation and the first reduced images show no border."""
+"""Texels that continue a chart, for interpolation and reduced images."""
 COARSER = 4
-"""The first pass, whose images are registered to vertex colours, makes a texture of a fourth of the width. The images
-of the second pass are registered to it, because it is sharper."""
+"""Width reduction of the first pass, registered to vertex colours; the second is registered to its sharper texture."""
 BEST = 3
-"""Views that are mixed in a texel."""
+"""Views mixed in a texel."""
 SHARP = 2.0
 """Exponent of the weights in the mixture."""
 STEEPEST = 0.2
 """Smallest cosine between viewing ray and normal."""
 ROWS = 64
-"""Rows of the texture that a thread fills at a time."""
+"""Rows that a thread fills at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,10 +40,10 @@ class TexturedMesh:
     """A mesh with a texture.
 
     Attributes:
-        mesh: Vertices on seams of the atlas are repeated.
-        uv: (V, 2) float32 place in the image from (0, 0), its upper left corner, to (1, 1).
+        mesh: Seam vertices are repeated.
+        uv: (V, 2) float32 place in the image, (0, 0) upper left to (1, 1).
         image: (S, S, 3) uint8.
-        seen: Share of the texels of the surface that a view shows; the others have vertex colours.
+        seen: Share of the surface's texels that a view shows; others have vertex colours.
     """
 
     mesh: Mesh
@@ -64,14 +63,13 @@ class TexturedMesh:
 
 
 def textured(run: RunContent, options: ExportOptions, chosen: "list[list[Taken]] | None" = None) -> TexturedMesh:
-    """The edited mesh of a run with a texture from its images, by the options' ``texture``, ``sequence``, ``every``.
-
-    ``chosen`` are the frames to use, None for all.
+    """The edited mesh of a run, textured from its images by ``texture``, ``sequence``, ``every``; ``chosen``: frames,
+    None for all.
 
     Raises:
         ConfigError: The size is out of range.
         NoImagesError: The run has no images.
-        DatasetError: The run has no masks, its poses do not belong to the recording, or the recording has no colour.
+        DatasetError: No masks, poses of another recording, or no colour.
         MissingExtraError: xatlas or fast-simplification is not installed.
     """
     size = options.texture or 0
@@ -113,7 +111,7 @@ def _reduced(options: ExportOptions) -> ExportOptions:
 
 
 def with_mean_colors(mesh: Mesh, fine: Mesh) -> Mesh:
-    """Mesh whose vertices have the mean colour of the nearest vertices of a finer mesh."""
+    """Mesh with the mean colours of the nearest vertices of a finer one."""
     from scipy.spatial import KDTree
 
     _, nearest = KDTree(mesh.vertices).query(fine.vertices, workers=-1)
@@ -124,7 +122,7 @@ def with_mean_colors(mesh: Mesh, fine: Mesh) -> Mesh:
 
 
 def unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, NDArray[np.float32]]:
-    """Mesh cut along the seams of an atlas, and the place (V, 2) of its vertices, 0 to 1."""
+    """Mesh cut along the seams of an atlas, and places (V, 2), 0 to 1."""
     with extra("texture", "--texture"):
         import xatlas
 
@@ -146,7 +144,7 @@ def _texels(mesh: Mesh, uv: NDArray[np.float32], size: int) -> NDArray[np.int32]
 
 
 def places(mesh: Mesh, uv: NDArray[np.float32], size: int) -> NDArray[np.float64]:
-    """(F, 3, 3) maps (column, row, 1) of a texel of a triangle to its point; 0 for triangles without a surface."""
+    """(F, 3, 3) maps texel (column, row, 1) of a triangle to its point; 0 without surface."""
     corners = np.ones((len(mesh.faces), 3, 3))
     corners[:, :2] = (uv[mesh.faces].astype(np.float64) * size - 0.5).transpose(0, 2, 1)
     out, flat = np.zeros_like(corners), np.abs(np.linalg.det(corners)) < 1e-6
@@ -164,10 +162,6 @@ def _gather(
     found: NDArray[np.uint16],
     colors: NDArray[np.uint8],
 ) -> None:
-    """Offer the colours of a view to all texels.
-
-    The weight of a triangle is its number of pixels per area: cosine over squared distance.
-    """
     T = se3.inverse(view.T_world_camera)
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     normal, ray = np.cross(b - a, c - a), (a + b + c) / 3 - view.T_world_camera[:3, 3]
@@ -193,7 +187,6 @@ def _gather(
 
 
 def _steps(weights: NDArray) -> NDArray[np.int32]:
-    """Logarithms of weights, in steps; 0 for a weight of 0."""
     steps = 1 + OCTAVE * (OCTAVES + np.log2(np.maximum(weights, 2.0**-OCTAVES)))
     return np.where(weights > 0, np.rint(steps), 0).astype(np.int32)
 
@@ -201,7 +194,6 @@ def _steps(weights: NDArray) -> NDArray[np.int32]:
 def _vertex_colors(
     fine: Mesh, A: NDArray[np.float64], faces: NDArray[np.int32], columns: NDArray[np.intp], rows: NDArray[np.intp]
 ) -> NDArray[np.uint8]:
-    """Colours (n, 3) of the nearest vertices of a mesh at texels (n,)."""
     from scipy.spatial import KDTree
 
     out, tree = np.empty((len(faces), 3), np.uint8), KDTree(fine.vertices)
@@ -216,10 +208,7 @@ def _vertex_colors(
 
 
 def _continued(image: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Image (S, S, 3), changed, whose unknown texels, given as 0, continue the known ones.
-
-    Viewers reduce the image, and JPEG spreads its edges.
-    """
+    """Image whose unknown texels, given as 0, continue the known ones."""
     import cv2
 
     if min(image.shape[:2]) == 1:

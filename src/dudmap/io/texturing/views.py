@@ -1,4 +1,4 @@
-"""Images of a run as sources of a texture: static pixels in the exposure of the map, without lens distortion."""
+"""Images of a run for a texture: static pixels, map exposure, no distortion."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,32 +22,28 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence as Recording
 
 APART, APART_DEG, SECONDS = 0.05, 3.0, 1.0
-"""Motion (metres, degrees) and time after which another view begins; each view is the sharpest of some of its frames.
-A surface 1.5 m away is then seen by a dozen views."""
+"""Motion (metres, degrees) and time to the next view, the sharpest of its frames: a dozen views of a surface 1.5 m
+away."""
 TRIED = 3
-"""Frames of a view that are read to find the sharpest."""
+"""Frames read to find the sharpest."""
 MOST = 300
-"""Most views; one of 640x480 pixels takes a tenth of a second."""
+"""Most views; one takes a tenth of a second."""
 MARGIN = 12 / 640
-"""Width by which masks grow, as a share of the image width: blur and mixed pixels, and the way of a walking person (1
-m/s at 1.5 m) in 20 ms between colour and depth."""
+"""Growth of masks, share of the width: blur, mixed pixels, and 20 ms of walking (1 m/s at 1.5 m)."""
 FADE = 24 / 640
-"""Distance from masks and depth edges at which pixels get their full weight, as a share of the image width."""
+"""Distance from masks and depth edges to full weight, share of the width."""
 LEAST = 0.02
-"""Share of the full weight at a depth edge, so that thin objects keep their colours."""
+"""Share of the weight at a depth edge, for thin objects."""
 TOLERANCE = 0.03
-"""Largest relative difference between measured depth and mesh: two standard deviations of a depth camera at 4 m (0.8
-%), and as much for the map."""
+"""Largest relative difference of depth and mesh: two standard deviations at 4 m (0.8 %), and as much for the map."""
 EDGE = 0.05
-"""Relative difference of neighbouring depths across an edge of an object: the surface is not steeper than 85 degrees at
-a focal length of 525 pixels and less."""
+"""Relative depth difference across an object's edge: surfaces below 85 degrees at a focal length of 525 pixels."""
 FARTHEST = 16 / 640
-"""Largest shift of an image onto the map, as a share of the width."""
+"""Largest shift of an image onto the map, share of the width."""
 STRIDE, SMOOTH = 2, 1 / 24
-"""Pixels per sample of registration and exposure; standard deviation of the exposure's smoothing as a share of the
-image width."""
+"""Pixels per sample; standard deviation of the exposure's smoothing, share of the width."""
 TWIST_TIME = 1 / 30
-"""Time between the poses that give the velocity during an exposure, seconds: a frame."""
+"""Seconds between the poses that give the velocity."""
 BRIGHTEST = 250
 """Brightest value of a channel that is not saturated."""
 
@@ -57,10 +53,10 @@ class View(NamedTuple):
 
     Attributes:
         T_world_camera: (4, 4) pose of the image.
-        image: (h, w, 3) uint8, of a camera without distortion, in the exposure of the map.
-        depth: (h, w) float32, metres, of the mesh; infinite without one.
-        weights: (h, w) float32 from 0, not to be used, to 1.
-        triangles: (h, w) int32, triangle of the mesh; -1 without one.
+        image: (h, w, 3) uint8, undistorted, map exposure.
+        depth: (h, w) float32, metres, of the mesh; infinite without.
+        weights: (h, w) float32, 0 = unused, to 1.
+        triangles: (h, w) int32; -1 = none.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -72,7 +68,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Taken:
-    """A frame with a pose and a mask: its number in the recording, pose (4, 4) of the depth image, file of the mask."""
+    """A frame with pose and mask: its number, pose (4, 4) of the depth image, mask file."""
 
     index: int
     T_world_camera: NDArray[np.float64]
@@ -80,7 +76,7 @@ class Taken:
 
 
 def groups(run: RunContent, sequence: "Recording", every: int = 1) -> list[list[Taken]]:
-    """Frames of the recording in groups from nearly the same place, of each of which one is used.
+    """Frames in groups from nearly the same place, to use one of each.
 
     Raises:
         DatasetError: The run has no masks, or none of its poses belongs to the recording.
@@ -109,8 +105,8 @@ class Views:
         run: Poses, masks and calibration.
         sequence: The recording of the run.
         mesh: The surface.
-        colors: (n, 3) corners and their shares (n, 3) to colours (n, 3) of the mesh, to which images are registered.
-        level: Whether images take the exposure of the mesh; else they stay as recorded.
+        colors: (n, 3) corners and shares (n, 3) to colours (n, 3) of the mesh, for registration.
+        level: Whether images take the mesh's exposure.
 
     Attributes:
         camera: Of all views.
@@ -136,7 +132,7 @@ class Views:
         self._readouts = (0.0, 0.0) if one is None else (one.depth_readout + one.readout, one.depth_readout)
 
     def __call__(self, chosen: Sequence[Sequence[Taken]]) -> Iterator[View]:
-        """The sharpest view of each group; unreadable frames are left out."""
+        """The sharpest view of each group; unreadable frames are omitted."""
         for group in chosen:
             read: list[tuple[float, Taken, Frame]] = []
             for frame in group[:: -(-len(group) // TRIED)]:
@@ -197,10 +193,6 @@ class Views:
         readout: float,
         bent: float | NDArray[np.float64] = 0.0,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Columns and rows (h, w) of points (h * w, 3), in the axes of a camera, in its image with a rolling shutter.
-
-        ``bent`` (h * w, 2) is added.
-        """
         lens = Lens(camera)
         uv = lens.project(points)[0] + bent
         if readout:
@@ -216,7 +208,6 @@ class Views:
     def _mesh_colors(
         self, T: NDArray[np.float64], triangles: NDArray[np.int32], depth: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """Colours (h / STRIDE, w / STRIDE, 3) of the mesh, NaN without one."""
         height, width = (STRIDE * (size // STRIDE) for size in depth.shape)
         rows, columns = np.mgrid[STRIDE // 2 : height : STRIDE, STRIDE // 2 : width : STRIDE]
         faces = triangles[rows, columns]
@@ -238,7 +229,7 @@ def vertex_colors(mesh: Mesh) -> Colors:
 def drawn(
     mesh: Mesh, T_world_camera: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Triangle (h, w) of a mesh at each pixel, -1 without one, and its depth (h, w), infinite without one."""
+    """Triangle (h, w) at each pixel, -1 = none, and depth (h, w), infinite without."""
     T = se3.inverse(T_world_camera)
     points = mesh.vertices.astype(np.float64) @ T[:3, :3].T + T[:3, 3]
     projected = np.empty((len(points), 3), np.float32)
@@ -259,7 +250,7 @@ def hit(
     faces: NDArray[np.int32],
     depth: NDArray[np.float32],
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Corners (n, 3) of the triangles at pixels (n,), and their shares (n, 3) there."""
+    """Corners (n, 3) of the triangles at pixels (n,), and shares (n, 3)."""
     points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
     points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     corners = mesh.faces[faces]
@@ -274,10 +265,10 @@ def hit(
 def levelled(
     image: NDArray[np.uint8], expected: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """Image (h, w, 3) in the exposure of the map: each channel times a gain that varies smoothly over the image.
+    """Image (h, w, 3) in the map's exposure: each channel times a smooth gain, which compensates exposure, white
+    balance, vignetting and shine.
 
-    This compensates exposure, white balance, vignetting and shine, and makes all views equal on average in each place,
-    so that they join without a seam. ``expected`` are the map's colours at every ``STRIDE``-th pixel.
+    ``expected``: the map's colours at every ``STRIDE``-th pixel.
     """
     import cv2
 
@@ -299,10 +290,10 @@ def levelled(
 def aligned(
     image: NDArray[np.uint8], expected: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Shift (h, w) of columns and rows that brings an image (h, w, 3) onto the map's colours; 0 if none is found.
+    """Shift (h, w) of columns and rows onto the map's colours; 0 if none is found.
 
-    Poses err by a pixel or two, which would blur a mixture of views and leave steps between them. The affine motion of
-    largest correlation is found (Evangelidis and Psarakis 2008).
+    Compensates pose errors of a pixel or two by the affine motion of largest correlation (Evangelidis and Psarakis
+    2008).
     """
     import cv2
 
@@ -334,7 +325,7 @@ def _averaged(image: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:
-    """Mean square of the Laplacian of an image (h, w, 3), for images of the same scene."""
+    """Mean square of the Laplacian of an image (h, w, 3)."""
     import cv2
 
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
@@ -350,7 +341,6 @@ def _grown(mask: NDArray[np.bool_], share: float) -> NDArray[np.uint8]:
 
 
 def _edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels (h, w) next to another depth, or to a hole of the mesh."""
     import cv2
 
     far = np.where(np.isfinite(depth), depth, np.float32(1e6))
