@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from dudmap.config import Config, keys
+from dudmap.config import Config, VolumeConfig, keys
 from dudmap.errors import ConfigError
 from dudmap.gone_keys import GONE
 
@@ -120,3 +120,13 @@ def test_a_configuration_made_in_python_gives_the_same_errors_as_a_file(values, 
 def test_sections_are_given_as_mappings_or_as_objects():
     by_mapping = Config(volume={"voxel_size": 0.02})
     assert by_mapping == Config(volume=by_mapping.volume) == Config().override(["volume.voxel_size=0.02"])
+
+
+@pytest.mark.parametrize("values", [{"voxel_sise": 0.02}, {"voxel_size": -1}, {"max_readings": 2}])
+def test_a_section_made_in_python_gives_the_same_errors_as_a_file(values):
+    with pytest.raises(ConfigError) as made:
+        VolumeConfig(**values)
+    with pytest.raises(ConfigError) as read:
+        Config.from_tree({"volume": values})
+    assert str(made.value).partition(" = ")[0] == str(read.value).partition(" = ")[0]
+    assert str(made.value).rpartition(": ")[2] == str(read.value).rpartition(": ")[2]

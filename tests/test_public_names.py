@@ -150,11 +150,17 @@ GOOD: dict[str, Any] = {
         ({"rgb": np.zeros(CAMERA.shape, np.uint8)}, r"rgb has the shape \(48, 64\) and the type uint8; expected"),
         ({"rgb": np.zeros((*CAMERA.shape, 3), np.float32)}, "the type float32; expected .* uint8, red green blue"),
         ({"timestamp": float("nan")}, "the timestamp is nan; expected a finite number of seconds"),
+        ({"depth": np.full(CAMERA.shape, 1500.0)}, "most depths are above 65.535 .* divide millimetres by 1000"),
     ],
 )
 def test_bad_arrays_are_one_sentence(changed, sentence):
     with pytest.raises(DatasetError, match=sentence):
         Slam(CAMERA).process(**(GOOD | changed))
+
+
+def test_an_image_in_place_of_a_frame_is_one_sentence():
+    with pytest.raises(DatasetError, match="the frame is a ndarray; expected a Frame, or depth= and rgb="):
+        Slam(CAMERA).process(GOOD["depth"])
 
 
 def test_frames_and_arrays_are_not_mixed():

@@ -5,20 +5,19 @@ parameter: ``volume.voxel_size``, ``tracker.huber``, ``dynamics.enabled``. A def
 on the recordings of docs/benchmarks.md.
 """
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import tomli_w
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from dudmap.atomic_file import write_text
-from dudmap.config_section import ConfigSection
+from dudmap.config_section import ConfigSection, check_key
 from dudmap.errors import ConfigError
 from dudmap.gone_keys import without_gone
-from dudmap.input_files import parse_toml, read_toml
+from dudmap.input_files import describe, parse_toml, read_toml
 from dudmap.ranges import RANGES, scaled
 from dudmap.thesis_config import ThesisConfig
 
@@ -271,12 +270,7 @@ class Config(ConfigSection):
         tree = {key: value.model_dump() if isinstance(value, ConfigSection) else value for key, value in values.items()}
         tree = without_gone(tree)
         _check_keys(tree)
-        try:
-            super().__init__(**tree)
-        except ValidationError as error:
-            first = error.errors()[0]
-            key = ".".join(str(part) for part in first["loc"]) or "configuration"
-            raise ConfigError(f"{key} = {first['input']!r} is not acceptable: {first['msg']}") from None
+        super().__init__(**tree)
 
     @classmethod
     def for_range(cls, name: str) -> "Config":
@@ -299,7 +293,7 @@ class Config(ConfigSection):
         try:
             tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"cannot read the configuration {path}: {error}") from error
+            raise ConfigError(f"cannot read the configuration {path}: {describe(error)}") from error
         except tomllib.TOMLDecodeError as error:
             raise ConfigError(f"the configuration {path} is not valid TOML: {error}") from error
         return cls.from_tree(tree, size)
@@ -388,9 +382,7 @@ def _check_keys(tree: Mapping[str, Any]) -> None:
     for part, values in tree.items():
         found = [f"{part}.{key}" for key in values] if isinstance(values, Mapping) else [part]
         for key in found:
-            if key not in known:
-                near = difflib.get_close_matches(key, known, n=1, cutoff=0.0)
-                raise ConfigError(f"unknown configuration key {key!r}; the nearest known key is {near[0]!r}")
+            check_key(key, known)
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

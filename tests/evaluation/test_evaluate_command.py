@@ -245,8 +245,16 @@ def test_times_per_stage_are_a_table_for_a_paper(tmp_path):
         assert figures[f"{stage}_median_ms"] == pytest.approx(np.median(columns.column(stage)), abs=1e-3)
         assert figures[f"{stage}_p95_ms"] == pytest.approx(np.percentile(columns.column(stage), 95), abs=1e-3)
     rows = (tmp_path / "run" / "timings.tex").read_text(encoding="utf-8").splitlines()
-    assert rows[2].startswith(f"total & {figures['total_median_ms']:.1f} & ")
-    assert len(rows) == 3 + len(columns.stages) + 1
+    assert rows[4].startswith(f"total & {figures['total_median_ms']:.1f} & ")
+    assert len(rows) == 5 + len(columns.stages) + 2
+    shown = evaluate("timings", tmp_path / "run").stdout.splitlines()
+    assert shown[0] == "| stage | median, ms | mean, ms | 95 %, ms |"
+    assert shown[2].startswith(f"| total | {figures['total_median_ms']:.1f} | ")
+
+
+def test_a_missing_file_is_told_without_the_words_of_the_system(tmp_path):
+    missing = tmp_path / "none.txt"
+    assert evaluate(missing).stderr == f"dudmap: cannot read {missing}: No such file or directory\n"
 
 
 def test_scale_and_time_offset_of_a_run(folders, tmp_path):

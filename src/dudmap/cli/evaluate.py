@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dudmap.evaluation.trajectory import Align
 
 Figures = dict[str, Any]
-
+QUANTILES = {"median": "median", "mean": "mean", "p95": "95 %"}
 
 app = typer.Typer(
     cls=DefaultGroup,
@@ -260,22 +260,29 @@ def timings(run: o.RunArgument, as_json: o.JsonOption = False, out: OutOption = 
     import numpy as np
 
     from dudmap.app.viewing.run_files import RunFiles
+    from dudmap.evaluation.tables import Column, table
 
     found = RunFiles.load(run)
     if not found.frames:
         raise DatasetError(f"{run} holds no times per frame (timings.csv); name a folder of dudmap run")
     figures: Figures = {"estimate": str(run), "frames": len(found.frames)}
-    lines = [r"\begin{tabular}{lrrr}", r"stage & median & mean & 95\,\% \\ \hline"]
+    columns = [Column("stage", "stage")] + [Column(key, f"{said}, ms", digits=1) for key, said in QUANTILES.items()]
+    rows: list[Figures] = []
     for stage in ["total", *found.stages]:
         times = found.column(stage)
-        row = float(np.median(times)), float(times.mean()), float(np.percentile(times, 95))
-        for name, value in zip(("median", "mean", "p95"), row, strict=True):
-            figures[f"{stage}_{name}_ms"] = round(value, 3)
-        cells = " & ".join(f"{value:.1f}" for value in row)
-        lines.append(f"{stage.replace('_', ' ')} & {cells} \\\\")
+        numbers = float(np.median(times)), float(times.mean()), float(np.percentile(times, 95))
+        rows.append({"stage": stage.replace("_", " ")} | dict(zip(QUANTILES, numbers, strict=True)))
+        figures |= {f"{stage}_{key}_ms": round(rows[-1][key], 3) for key in QUANTILES}
     target = _output_folder(out, run)
-    write_text(target / "timings.tex", "\n".join([*lines, r"\end{tabular} % milliseconds per frame"]) + "\n")
-    _report(figures, target / "timings.evaluation.json", [target / "timings.tex"], as_json=as_json, title="timings")
+    written = [target / "timings.evaluation.json", target / "timings.tex"]
+    _write_json(written[0], figures)
+    with writing(written[1]):
+        write_text(written[1], table(rows, columns, "latex"))
+    if as_json:
+        say(json.dumps(figures, allow_nan=False))
+        return
+    say(table(rows, columns, "md").rstrip("\n"))
+    say("written: " + ", ".join(map(str, written)), err=True)
 
 
 def _plot_ending(plots: bool, plot_format: str | None) -> str:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 from typer import Option
 
-from dudmap.app.terminal import say
+from dudmap.app.terminal import say, show_log
 from dudmap.cli import options as o
 from dudmap.cli.output import answer
 from dudmap.errors import NoImagesError
@@ -54,6 +54,7 @@ def export(
     """Write trajectory, surface, space or images of a run for another program."""
     from dudmap.io.exporting.exporters import export_run
 
+    show_log(quiet=quiet)
     low, high = o.numbers(heights, 2, "--heights")
     options = ExportOptions(
         max_triangles=max_triangles,
@@ -78,4 +79,4 @@ def export(
         options = replace(options, texture=None, sequence=None, camera=None, every=1)
         path = export_run(run, out, options)
     tree = {"export": path, "bytes": path.stat().st_size, "texture": options.texture}
-    answer(tree, f"written to {path}", as_json=as_json, quiet=quiet)
+    answer(tree, f"written to {path} ({1e-6 * tree['bytes']:.1f} MB)", as_json=as_json, quiet=quiet)

@@ -55,4 +55,9 @@ def render(
             upright = up_of(content, ExportOptions(up=o.direction(up)))
             path = rendering.orbit(content, upright, sweep, 1 if picture else max_frames, fps, camera)
         count = rendering.render_run(content, path, out, camera=camera, fps=fps, progress=progress, whole=orbit)
-    answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)
+    answer(
+        {"frames": count, "out": out},
+        f"written to {out}" if picture else f"{count} frames written to {out}",
+        as_json=as_json,
+        quiet=quiet,
+    )

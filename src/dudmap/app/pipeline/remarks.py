@@ -24,11 +24,13 @@ def remarks(slam: "Slam", record: RunRecord) -> Iterator[str]:
         total = dropped + len(record.rows) + len(record.unreadable)
         yield f"live: {dropped} of {total} frames were dropped"
     if omitted := [row["shed"] for row in record.rows if row.get("shed")]:
-        labels, fusion = (sum(shed >= step for shed in omitted) for step in (Shed.LABELS, Shed.FUSION))
-        yield (
-            f"live: for lack of time, {len(omitted)} frames have no moving objects, {labels} have the labels of the "
-            f"frame before, {fusion} are not fused"
-        )
+        steps = {
+            Shed.MOVERS: "have no moving objects", Shed.LABELS: "have the labels of the frame before",
+            Shed.FUSION: "are not fused",
+        }  # fmt: skip
+        counts = {said: sum(shed >= step for shed in omitted) for step, said in steps.items()}
+        said = ", ".join(f"{count} {said}" for said, count in counts.items() if count)
+        yield f"live: for lack of time, of {len(record.rows)} frames {said}"
 
 
 def _unmerged_submaps(slam: "Slam") -> str:

@@ -21,6 +21,8 @@ NO_COLOR = (
     "{} has the shape {} and the type {}; expected (H, W, 3) uint8, red green blue; 16-bit values are depth, which "
     "needs no colour"
 )
+FARTHEST = 65.535
+"""Largest depth of a 16-bit image of millimetres, metres. A floating-point image beyond it is of another unit."""
 GREY = 192
 """Grey value of frames without colour: light, so that shading is visible."""
 
@@ -95,6 +97,12 @@ class Frame:
             metres = readings.astype(np.float32) / np.float32(depth_scale)
         else:
             metres = np.where(np.isfinite(readings), readings, 0).astype(np.float32)
+            sample = metres[::8, ::8]
+            if (sample > FARTHEST).sum() > (sample > 0).sum() / 2:
+                raise FrameError(
+                    f"most depths are above {FARTHEST:g} (the largest is {sample.max():g}); floating point is metres: "
+                    "divide millimetres by 1000"
+                )
         return cls(float(timestamp), metres, color)
 
 
@@ -106,8 +114,12 @@ def given_frame(frame: _Prepared | None, arrays: FrameArrays, depth_scale: float
 
     Raises:
         ConfigError: Neither a frame nor both ``depth`` and ``timestamp`` are given, or both kinds.
-        FrameError: As for ``Frame.from_arrays``.
+        FrameError: The frame is something else, or as for ``Frame.from_arrays``.
     """
     if (frame is None) != (set(arrays) | {"rgb"} == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
         raise ConfigError("Slam.process takes either a frame, or depth=, timestamp= and, if there is colour, rgb=")
+    if frame is not None and not hasattr(frame, "timestamp"):
+        raise FrameError(
+            f"the frame is a {type(frame).__name__}; expected a Frame, or images as depth= and rgb=", "type"
+        )
     return Frame.from_arrays(**arrays, depth_scale=depth_scale) if frame is None else frame  # pyright: ignore

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.times import SECONDS, TimeUnit, time_unit
 from dudmap.errors import DatasetError
-from dudmap.input_files import read_text
+from dudmap.input_files import describe, read_text
 
 LARGEST_GAP = 0.02
 """Largest time difference of a pair, seconds (TUM benchmark)."""
@@ -54,7 +54,7 @@ def _lines(path: Path, columns: str, *, short: bool = False) -> Iterator[tuple[i
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"cannot read {path}: {error}") from error
+        raise DatasetError(f"cannot read {path}: {describe(error)}") from error
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line.strip(", ") and not line.startswith("#")]
     rows = lines[1:] if len(lines) > 1 and not re.search(r"\d", lines[0][1]) else lines

@@ -14,7 +14,7 @@ from dudmap.core.arrays import copied
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, printable
-from dudmap.input_files import DAMAGE, read_toml
+from dudmap.input_files import DAMAGE, describe, read_toml
 
 PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
@@ -198,7 +198,7 @@ class Calibration:
         try:
             tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
-            raise DatasetError(f"cannot read the calibration {path}: {error}") from error
+            raise DatasetError(f"cannot read the calibration {path}: {describe(error)}") from error
         except tomllib.TOMLDecodeError as error:
             raise DatasetError(f"the calibration {path} is not valid TOML: {error}") from error
         try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.core.arrays import copied
 from dudmap.errors import MapError
-from dudmap.input_files import foreign, open_plain
+from dudmap.input_files import describe, foreign, open_plain
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
@@ -97,7 +97,7 @@ class Mesh:
         try:
             own = cls._load_ply(path) if path.suffix.lower() == ".ply" else None
         except OSError as error:
-            raise MapError(f"cannot read the mesh {path}: {error}") from error
+            raise MapError(f"cannot read the mesh {path}: {describe(error)}") from error
         if own is not None and len(own.vertices) > 0:
             return own
         if path.suffix.lower() not in FORMATS:  # other formats may be archives or refer to further files

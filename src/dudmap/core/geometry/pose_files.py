@@ -13,7 +13,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import read_rows
 from dudmap.core.geometry.times import SECONDS, UNITS, time_unit
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.input_files import read_text
+from dudmap.input_files import describe, read_text
 
 NANOSECONDS = UNITS[-1]
 LARGEST_ERROR = 0.02
@@ -67,7 +67,7 @@ def pose_format(path: Path, option: str = "--format") -> PoseFormat:
     try:
         lines = [line.strip() for line in read_text(path).splitlines()]
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"cannot read {path}: {error}") from error
+        raise DatasetError(f"cannot read {path}: {describe(error)}") from error
     order = next(filter(None, map(_named_order, lines[:SAMPLED])), None)
     if order in ORDERS:
         return FORMATS[ORDERS[order]]

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError
+from dudmap.input_files import describe
 from dudmap.lab.benchmark.measure import code_hash
 from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.data import find
@@ -206,7 +207,7 @@ def load_plan(path: str | Path) -> Plan:
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read the design {path}: {error}") from error
+        raise ConfigError(f"cannot read the design {path}: {describe(error)}") from error
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"the design {path} is not valid TOML: {error}") from error
     return make_plan(tree, path.parent, path.stem)
