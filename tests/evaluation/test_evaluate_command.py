@@ -220,6 +220,7 @@ def test_the_truth_of_a_recording_is_read_as_its_format_stores_it(tmp_path):
     for layout, stamps in ((bonn, [100, 100.1, 100.2]), (replica, [0, 1 / 30, 2 / 30])):
         folder, _ = write(layout, tmp_path / layout.__name__)
         found = find_reference(folder, None)
+        assert found is not None
         np.testing.assert_allclose(load_reference(found).Ts_world_camera, [pose(k) for k in range(3)], atol=1e-6)
         assert tracked_share(2, None, found) == pytest.approx(2 / 3, abs=1e-6)
         estimate = tmp_path / f"{layout.__name__}.txt"

@@ -74,5 +74,5 @@ def test_a_live_run_counts_and_names_omitted_work(slam, tmp_path, caplog, monkey
     assert frames > 1
     assert metrics["shed"] == {"movers": frames - 1, "labels": frames - 1, "fusion": 0}
     assert set(shown) == {SAID[Shed.LABELS]}
-    assert any(f"{frames - 1} frames have no moving objects" in message for message in caplog.messages)
+    assert any(f"of {frames} frames {frames - 1} have no moving objects" in message for message in caplog.messages)
     assert "shed" not in run(sequence, Config(), tmp_path / "unhurried", progress=False).metrics

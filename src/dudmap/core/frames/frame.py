@@ -119,7 +119,5 @@ def given_frame(frame: _Prepared | None, arrays: FrameArrays, depth_scale: float
     if (frame is None) != (set(arrays) | {"rgb"} == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
         raise ConfigError("Slam.process takes either a frame, or depth=, timestamp= and, if there is colour, rgb=")
     if frame is not None and not hasattr(frame, "timestamp"):
-        raise FrameError(
-            f"the frame is a {type(frame).__name__}; expected a Frame, or images as depth= and rgb=", "type"
-        )
+        raise FrameError(f"the frame is a {type(frame).__name__}; expected a Frame, or depth= and rgb=", "type")
     return Frame.from_arrays(**arrays, depth_scale=depth_scale) if frame is None else frame  # pyright: ignore
