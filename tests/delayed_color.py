@@ -30,7 +30,7 @@ def find_early(monkeypatch, attempts):
     monkeypatch.setattr(self_calibration, "estimate_beside", _estimated)
 
 
-def _estimated(estimator, keyframes) -> Future:
+def _estimated(estimator, keyframes, **_) -> Future:
     """Result of an estimation in this process, where the class above is known."""
     future = Future()
     future.set_result(estimator.estimate(keyframes))

@@ -61,7 +61,9 @@ def estimator(monkeypatch):
     monkeypatch.setattr(self_calibration, "CalibrationEstimator", made)
     with ThreadPoolExecutor(1) as beside:
         monkeypatch.setattr(
-            self_calibration, "estimate_beside", lambda estimator, frames: beside.submit(estimator.estimate, frames)
+            self_calibration,
+            "estimate_beside",
+            lambda estimator, frames, idle: beside.submit(estimator.estimate, frames),
         )
         yield made
         made.may.set()

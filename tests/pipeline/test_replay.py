@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dudmap.app.pipeline import frame_source
-from dudmap.app.pipeline.frame_source import FrameQueue, SourceFrame, arriving
+from dudmap.app.pipeline.frame_source import CATCH_UP, MAX_DELAY, FrameQueue, SourceFrame, arriving
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
@@ -64,8 +64,17 @@ def test_a_reader_that_is_too_slow_leaves_frames_out():
     np.testing.assert_allclose(times, 0.1 * np.array(indices), atol=1e-9)
 
 
-def test_only_frames_of_the_last_moment_wait():
+@pytest.fixture
+def clock(monkeypatch):
+    """The time that the queue reads, seconds."""
+    now = [0.0]
+    monkeypatch.setattr(frame_source.time, "perf_counter", lambda: now[0])
+    return now
+
+
+def test_only_frames_of_the_last_moment_wait(clock):
     queue = FrameQueue()
+    clock[0] = MAX_DELAY / CATCH_UP
     for number, arrived in enumerate([0.0, 0.2, 0.26, 0.29, 0.32]):
         queue.put(SourceFrame(number, "", arrival=arrived))
     assert queue.take().number == 2, "that at 0.2 is too old"
@@ -74,6 +83,57 @@ def test_only_frames_of_the_last_moment_wait():
     assert queue.take().number == 5
     assert queue.take() is None
     assert queue.take() is None
+
+
+def consumed(clock, delays, start=1.1 * MAX_DELAY / CATCH_UP):
+    """Numbers of the frames of a camera of 30 Hz that a consumer takes, and their ages; each delays the next ``take``.
+
+    The queue is ``start`` seconds old when the first frame arrives.
+    """
+    queue, numbers, ages, arrived, now = FrameQueue(), [], [], 0, start
+    for delay in (0.0, *delays):
+        now = max(now + delay, start + arrived / 30 if queue.is_empty else 0)
+        while (arrival := start + arrived / 30) <= now:
+            clock[0] = arrival
+            queue.put(SourceFrame(arrived, "", arrival=arrival))
+            arrived += 1
+        clock[0] = now
+        frame = queue.take()
+        numbers.append(frame.number)
+        ages.append(now - frame.arrival)
+    return np.array(numbers), np.array(ages)
+
+
+def test_one_long_frame_drops_none(clock):
+    numbers, ages = consumed(clock, [0.02] * 30 + [0.6] + [0.02] * 90)
+    assert np.array_equal(numbers, np.arange(122))
+    assert ages.max() > 0.5
+    assert ages[-1] < 0.02, "the consumer has caught up"
+
+
+def test_slow_frames_of_the_start_drop_none(clock):
+    assert np.array_equal(consumed(clock, [0.05] * 30, start=0.0)[0], np.arange(31))
+
+
+def test_frames_do_not_wait_longer_than_the_longest_frame(clock):
+    numbers, ages = consumed(clock, [0.3] * 20 + [3.0, 0.06])
+    assert ages[:-2].max() <= 0.34
+    assert ages[-1] <= MAX_DELAY + 0.06
+    assert len(numbers) == 23
+
+
+def test_a_consumer_that_only_keeps_up_drops_single_frames_after_a_long_one(clock):
+    numbers, ages = consumed(clock, [0.6] + [1 / 30] * 600)
+    assert ages[100] > 0.3
+    assert ages[-1] <= 0.1 + 1e-9
+    assert set(np.diff(numbers[1:])) == {1, 2}
+    assert np.diff(np.flatnonzero(np.diff(numbers[1:]) == 2)).min() >= 15
+
+
+def test_a_consumer_that_is_too_slow_gets_recent_frames(clock):
+    numbers, ages = consumed(clock, [0.06] * 200)
+    assert ages.max() <= 0.1 + 0.06
+    assert numbers[-1] > 350
 
 
 def test_a_consumer_waits_for_the_next():
@@ -93,7 +153,8 @@ def test_a_frame_that_takes_twice_as_long_drops_none():
     assert numbers == list(range(8))
 
 
-def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
+def test_a_slow_consumer_skips_frames_and_gets_the_last_one(monkeypatch):
+    monkeypatch.setattr(frame_source, "MAX_DELAY", frame_source.MAX_WAIT)
     arrivals = []
     for arrival in in_real_time(0.01 * np.arange(30)):
         arrivals.append(arrival)
@@ -148,7 +209,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, monkeypatch):
+def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, caplog, monkeypatch):
     fast = FakeSlam.process
 
     def slow(self, frame):
@@ -156,6 +217,7 @@ def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, mo
         return fast(self, frame)
 
     monkeypatch.setattr(slam, "process", slow)
+    monkeypatch.setattr(frame_source, "MAX_DELAY", frame_source.MAX_WAIT)
     out = tmp_path / "out"
     report = run(open_sequence(recording), Config(), out, live=True, progress=False)
     metrics = json.loads((out / "metrics.json").read_text())
@@ -169,7 +231,7 @@ def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, mo
     assert rows[0]["timestamp"] == "100.000000"
     assert rows[-1]["timestamp"] == "100.350000"
     assert all(float(row["latency"]) >= float(row["total"]) for row in rows)
-    assert f"live: {metrics['dropped']} of 8 frames were dropped" in capsys.readouterr().err
+    assert f"live: {metrics['dropped']} of 8 frames were dropped" in caplog.text
 
 
 def test_a_live_run_in_time_drops_nothing(slam, recording, tmp_path, capsys):

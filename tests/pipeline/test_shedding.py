@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 from dudmap.app.pipeline.run import run
-from dudmap.app.pipeline.shedding import CALM, SAID, SPAN, Shedding
+from dudmap.app.pipeline.shedding import CALM, SAID, SPAN, STEPS, Shedding
 from dudmap.config import Config
 from dudmap.core.shed import Shed
 from dudmap.io.cameras.replay import ReplayCamera
@@ -18,7 +18,7 @@ def fed(shedding, busy, frames, first=0, step=1):
     steps = []
     for number in range(first, first + frames * step, step):
         shedding.add(number, number * PERIOD, busy * PERIOD)
-        steps.append(shedding.step)
+        steps.append(shedding.omitted)
     return steps
 
 
@@ -27,9 +27,9 @@ def test_frames_in_time_omit_nothing():
 
 
 def test_slow_frames_omit_more_and_more_in_order():
-    steps = fed(Shedding(), 1.2, 4 * SPAN)
-    assert [b for a, b in pairwise(steps) if b != a] == [Shed.MOVERS, Shed.LABELS, Shed.FUSION]
-    assert steps[-1] == Shed.FUSION
+    steps = fed(Shedding(), 1.2, 5 * SPAN)
+    assert [b for a, b in pairwise(steps) if b != a] == STEPS[1:]
+    assert steps[-1] == sum(Shed, Shed.NOTHING)
 
 
 def test_dropped_frames_do_not_lengthen_the_period():
@@ -42,7 +42,7 @@ def test_bursts_do_not_change_the_period():
     fed(shedding, 0.9, 30)
     for number in range(30, 100):
         shedding.add(number, (number - number % 2) * PERIOD, 0.9 * PERIOD)
-        assert shedding.step == Shed.NOTHING
+        assert shedding.omitted == Shed.NOTHING
 
 
 def test_one_slow_frame_is_at_most_one_step():
@@ -54,10 +54,10 @@ def test_one_slow_frame_is_at_most_one_step():
 
 def test_work_is_taken_back_step_by_step_when_there_is_time():
     shedding = Shedding()
-    fed(shedding, 1.2, 4 * SPAN)
-    steps = fed(shedding, 0.6, 6 * CALM, 4 * SPAN)
-    assert steps[CALM - 2] == Shed.FUSION
-    assert [b for a, b in pairwise(steps) if b != a] == [Shed.LABELS, Shed.MOVERS, Shed.NOTHING]
+    fed(shedding, 1.2, 5 * SPAN)
+    steps = fed(shedding, 0.6, 7 * CALM, 5 * SPAN)
+    assert steps[CALM - 2] == STEPS[-1]
+    assert [b for a, b in pairwise(steps) if b != a] == STEPS[-2::-1]
     shedding = Shedding()
     fed(shedding, 1.2, SPAN + 1)
     assert set(fed(shedding, 0.85, 100, SPAN + 1)) == {Shed.MOVERS}, "neither too slow nor with time to spare"
@@ -66,13 +66,13 @@ def test_work_is_taken_back_step_by_step_when_there_is_time():
 def test_a_live_run_counts_and_names_omitted_work(slam, tmp_path, caplog, monkeypatch):
     caplog.set_level("INFO", "dudmap.app")
     shown = []
-    monkeypatch.setattr("dudmap.app.pipeline.run.Shedding.add", lambda self, *_: setattr(self, "step", Shed.LABELS))
+    monkeypatch.setattr("dudmap.app.pipeline.run.Shedding.add", lambda self, *_: setattr(self, "_step", 2))
     monkeypatch.setattr("dudmap.app.pipeline.progress.RunProgress.frame", lambda *given: shown.append(given[-1]))
     sequence = open_sequence(write_recording(tmp_path / "desk", 4))
     metrics = run(ReplayCamera(sequence), Config(), tmp_path / "out", progress=False).metrics
     frames = metrics["frames"]
     assert frames > 1
-    assert metrics["shed"] == {"movers": frames - 1, "labels": frames - 1, "fusion": 0}
-    assert set(shown) == {SAID[Shed.LABELS]}
+    assert metrics["shed"] == {"movers": frames - 1, "labels": 0, "fusion": frames - 1, "most": 0}
+    assert set(shown) == {SAID[STEPS[2]]}
     assert any(f"of {frames} frames {frames - 1} have no moving objects" in message for message in caplog.messages)
     assert "shed" not in run(sequence, Config(), tmp_path / "unhurried", progress=False).metrics

@@ -71,9 +71,10 @@ class Slam(SlamResults, Stateful):
         cues: Further evidence of motion, not stored with the state.
 
     Attributes:
-        shed: Work to omit from the next frames. Labels and fusion are only omitted within 0.05 s of a labelled frame
-            (every second one at 30 Hz), and never in a young map, after a mostly moving view, or after a frame that was
-            not tracked. Not stored with the state.
+        shed: Work to omit from the next frames, to save time. Labels and fusion are omitted from every second frame
+            (with ``MOST``, two of three), but not after a frame without pose. Labels are computed if the map is young,
+            if most of the last view moved, or if most moving pixels have left their place. It is not stored with the
+            state.
     """
 
     stream: Remembered[StreamCheck]
@@ -92,6 +93,7 @@ class Slam(SlamResults, Stateful):
     objects: Remembered[MovingObjects]
     shed: Shed = Shed.NOTHING
     _last: Remembered[FrameResult | None] = None  # result of the last frame, for a frame that repeats it
+    _omissions: Remembered[int] = 0  # frames in a row whose labels and fusion could be omitted
 
     def __init__(
         self,
@@ -217,7 +219,7 @@ class Slam(SlamResults, Stateful):
         if self.reference.is_empty:
             return self._start_map(view)
         blind = view.textureless or self.stream.repeats == "color"  # the colours carry no information
-        view = replace(view, blind=blind and not self.young_map.textureless, shed=self._omitted(view.timestamp))
+        view = replace(view, blind=blind and not self.young_map.textureless)
         with view.timer("rebuild"):
             self.atlas.continue_rebuilding()
             if (correction := self.mapper.refine_first_poses(self.tracker)) is not None:
@@ -226,7 +228,7 @@ class Slam(SlamResults, Stateful):
         restarted = self._decide_start(view, prediction)
         if restarted:
             prediction = self.predictor.predict(self.reference, view)
-        last = self.predictor.image_motion.last
+        view, last = replace(view, shed=self._omitted(view, prediction)), self.predictor.image_motion.last
         view, estimate, verdict = self.front_end.judged(self.reference, view, prediction, last)
         registered = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         verdict = self.relocalizer.verdict + verdict
@@ -259,12 +261,15 @@ class Slam(SlamResults, Stateful):
             _find_movers=None if view.shed else self.objects.update(view, estimate),
         )  # fmt: skip
 
-    def _omitted(self, timestamp: float) -> Shed:
-        """Work that ``shed`` omits from this frame."""
+    def _omitted(self, view: FrameView, prediction: PosePrediction) -> Shed:
+        """Work that is omitted from this frame, see ``shed``."""
+        tracked = self._last is not None and self._last.status is Status.TRACKED
+        self._omissions = 0 if not tracked or self._omissions >= 1 + (Shed.MOST in self.shed) else self._omissions + 1
+        if self._omissions == 0:
+            return self.shed & Shed.MOVERS
         young = self.young_map.first is not None or self.predictor.image_motion.active
-        followed = self._last is not None and self._last.status is Status.TRACKED and not self.predictor.mostly_dynamic
-        labelled = self.detector.memory.is_recent(timestamp)
-        return self.shed if followed and labelled and not young else min(self.shed, Shed.MOVERS)
+        carried = not young and self.detector.memory.can_carry(view.labelled, prediction.T_world_camera)
+        return self.shed if carried and not self.predictor.mostly_dynamic else self.shed & ~Shed.LABELS
 
     def _rectified(self, view: FrameView) -> FrameView:
         """The frame rectified to the time of its middle row."""
@@ -423,7 +428,7 @@ class Slam(SlamResults, Stateful):
             Outcome.of("blind", view.blind and not repeats, 0, "the image has no contrast, or the light has changed"),
             *estimate.doubts(view),
             Outcome.of("localize", self.localize, 0, "the map is not changed"),
-            *((Outcome.of("shed", 1, 0, "no time to fuse the frame"),) if view.shed >= Shed.FUSION else ()),
+            *((Outcome.of("shed", 1, 0, "no time to fuse the frame"),) if Shed.FUSION in view.shed else ()),
         ))  # fmt: skip
         with view.timer("similarity"):
             redundant = certain.accepted and self.redundancy.is_redundant(self.atlas.volume, view, estimate)

@@ -57,7 +57,7 @@ def process_source(
     start = time.perf_counter()
     frame = read.prepared or read.frame
     if shedding is not None:
-        slam.shed = shedding.step
+        slam.shed = shedding.omitted
     try:
         given: dict[str, Any] = {} if given_mask is None else {"dynamic_mask": given_mask}
         if poses is not None:
@@ -106,4 +106,4 @@ def process_source(
         log.info("frame %d: %s", index, outcome(slam.calibration, slam.camera))
     if shedding is not None:
         shedding.add(index, source.arrival, time.perf_counter() - start)
-    display.frame(index, result, record.dropped, "" if shedding is None else SAID[shedding.step])
+    display.frame(index, result, record.dropped, "" if shedding is None else SAID[shedding.omitted])

@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 
 AHEAD = 4
 """Frames read ahead."""
+MAX_DELAY = 1.0
+"""Longest time for which frames of a camera wait at the start and after a long frame, seconds: the first frames of a
+map take longest, and a gap of this length loses the camera."""
+CATCH_UP = 0.05
+"""Decrease of this time, seconds per second: it drops at most every twentieth frame."""
 
 
 class FrameRead(NamedTuple):
@@ -90,9 +95,14 @@ def read_ahead(
 
 
 class FrameQueue:
-    """Thread-safe queue of the newest item and items at most ``MAX_WAIT`` older."""
+    """Thread-safe queue between a camera and its consumer: the newest item, and items at most some time older.
+
+    The time is ``MAX_WAIT``. It is ``MAX_DELAY`` at the start, and rises to the time between two ``take`` if the frame
+    in between took longer; then it falls by ``CATCH_UP`` per second. So a single long frame drops none.
+    """
 
     def __init__(self) -> None:
+        self._peak, self._since, self._taken = MAX_DELAY, time.perf_counter(), np.inf
         self._changed = threading.Condition()
         self._held: list[SourceFrame] = []
         self._closed = False
@@ -105,14 +115,22 @@ class FrameQueue:
     def put(self, item: SourceFrame) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
-            self._held = [held for held in self._held if item.arrival - held.arrival <= MAX_WAIT] + [item]
+            longest, _ = self._longest_wait()
+            self._held = [held for held in self._held if item.arrival - held.arrival <= longest] + [item]
             self._changed.notify()
 
     def take(self) -> SourceFrame | None:
         """Take the oldest item, or wait for one. None once the queue is closed and empty."""
         with self._changed:
+            self._peak, self._since = self._longest_wait()
             self._changed.wait_for(lambda: self._held or self._closed)
+            self._taken = time.perf_counter()
             return self._held.pop(0) if self._held else None
+
+    def _longest_wait(self) -> tuple[float, float]:
+        """Longest time that an item waits now, and the present time, seconds."""
+        now = time.perf_counter()
+        return max(MAX_WAIT, self._peak - CATCH_UP * (now - self._since), min(now - self._taken, MAX_DELAY)), now
 
     def close(self) -> None:
         """Declare the end of the stream."""

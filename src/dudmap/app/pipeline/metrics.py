@@ -198,10 +198,10 @@ class RunRecord:
         if self.mask_ious:
             out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
         if self.dropped is not None:
-            latencies, shed = self._column("latency"), self._column("shed")
+            latencies, shed = self._column("latency"), np.array([row["shed"] for row in self.rows], int)
             out |= {
                 "dropped": self.dropped,
-                "shed": {step.name.lower(): int(np.count_nonzero(shed >= step)) for step in Shed if step},
+                "shed": {step.name.lower(): int(np.count_nonzero(shed & step)) for step in Shed},
                 "latency_ms_median": _number(np.median(latencies)),
                 "latency_ms_p95": _number(np.percentile(latencies, 95)),
             }

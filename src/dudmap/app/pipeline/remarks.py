@@ -28,7 +28,7 @@ def remarks(slam: "Slam", record: RunRecord) -> Iterator[str]:
             Shed.MOVERS: "have no moving objects", Shed.LABELS: "have the labels of the frame before",
             Shed.FUSION: "are not fused",
         }  # fmt: skip
-        counts = {said: sum(shed >= step for shed in omitted) for step, said in steps.items()}
+        counts = {said: sum(step in Shed(shed) for shed in omitted) for step, said in steps.items()}
         said = ", ".join(f"{count} {said}" for said, count in counts.items() if count)
         yield f"live: for lack of time, of {len(record.rows)} frames {said}"
 

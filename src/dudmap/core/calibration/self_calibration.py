@@ -77,7 +77,8 @@ class SelfCalibration(Stateful):
         if self._frames >= self._attempts[0] and self._running is None:
             self._attempts.pop(0)
             self._used_from = self._frames + USED_AFTER
-            self._running = estimate_beside(CalibrationEstimator(self.given, self.sensor), self._collector.keyframes)
+            estimator = CalibrationEstimator(self.given, self.sensor)
+            self._running = estimate_beside(estimator, self._collector.keyframes, idle=self.live)
             if not self._attempts:
                 self._collector.clear()
 

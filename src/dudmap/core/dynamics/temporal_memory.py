@@ -31,8 +31,9 @@ MAX_DISPLACEMENT = 0.1
 DYNAMIC_SHARE = 0.2
 """Smallest dynamic share of a segment that is remembered as dynamic."""
 
-CARRIED_TIME = 0.05
-"""Longest time over which labels are carried, seconds: a fast walker, 2 m/s, moves by MAX_DISPLACEMENT."""
+CARRIED_SHARE = 0.5
+"""Smallest share of dynamic pixels that is still dynamic in the next frame, for labels that are carried: with
+DYNAMIC_SHARE of its pixels, a segment is dynamic as a whole."""
 
 
 @dataclass(eq=False)
@@ -132,9 +133,13 @@ class TemporalMemory(Stateful):
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def is_recent(self, timestamp: float) -> bool:
-        """Whether labels of the last frame can be carried to this time."""
-        return self._last is not None and timestamp - self._last.timestamp <= CARRIED_TIME
+    def can_carry(self, level: Level, T_world_camera: NDArray[np.float64]) -> bool:
+        """Whether the labels of the last frame can be carried to an image at a predicted pose (4, 4): most of the
+        dynamic pixels have not moved by their own size."""
+        if self._last is None:
+            return False
+        carried = np.count_nonzero(self.last_dynamic(level, T_world_camera))
+        return bool(carried >= CARRIED_SHARE * np.count_nonzero(self._last.dynamic))
 
     def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Pixels (h, w) of an image at a pose (4, 4) whose points were in a dynamic segment in the last frame."""

@@ -274,7 +274,7 @@ class FrontEnd(Stateful):
         indistinguishable pose is static.
         """
         with view.timer("label"):
-            if view.shed >= Shed.LABELS and prediction.moving is None:
+            if Shed.LABELS in view.shed and prediction.moving is None:
                 labels = self.detector.carried(
                     volume, view.labelled, tracking.T_world_camera, view.segmentation, tracking.exposure
                 )
