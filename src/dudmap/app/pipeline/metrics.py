@@ -201,7 +201,9 @@ class RunRecord:
             latencies, shed = self._column("latency"), np.array([row["shed"] for row in self.rows], int)
             out |= {
                 "dropped": self.dropped,
-                "shed": {step.name.lower(): int(np.count_nonzero(shed & step)) for step in Shed},
+                "shed": {
+                    name.lower(): int(np.count_nonzero(shed & step)) for name, step in Shed.__members__.items() if step
+                },
                 "latency_ms_median": _number(np.median(latencies)),
                 "latency_ms_p95": _number(np.percentile(latencies, 95)),
             }
