@@ -84,6 +84,7 @@ def when_found(live: bool, estimator) -> int | None:
         calibrating.add(observation, T, mask, 0)
         if live and n == FIRST + 2:
             estimator.may.set()
+            assert calibrating._running is not None
             calibrating._running.result(20)
         if calibrating.found() is not None:
             assert calibrating.finished
@@ -147,7 +148,7 @@ def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator):
     config = Config().override(["loops.keep_gap=1", "volume.min_weight=1"])
     slam = Slam(SMALL, config)
     views = [slam.prepare(faulty[index]) for index in range(FRAMES)]
-    results, before = [], None
+    results, before = [], np.nan
     for index in range(FRAMES):
         results.append(slam.process(views[index]))
         if index == FIRST - 1:

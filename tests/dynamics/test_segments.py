@@ -114,17 +114,6 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
 
 
-def test_labels_are_carried_while_most_of_a_mover_has_not_left_its_place():
-    memory, (image, board) = TemporalMemory(DynamicsConfig()), scene(0.0)
-    assert not memory.can_carry(image, np.eye(4)), "there is no last frame"
-    memory.update(0.0, image, np.eye(4), np.zeros_like(board), segment(image, TOLERANCE))
-    assert memory.can_carry(image, np.eye(4)), "nothing moves"
-    memory.update(0.1, image, np.eye(4), board, segment(image, TOLERANCE))
-    assert memory.can_carry(scene(0.3)[0], np.eye(4)), "5/8 of the board overlap"
-    assert not memory.can_carry(scene(0.5)[0], np.eye(4)), "3/8 of the board overlap"
-    assert not memory.can_carry(image, se3.exp(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))), "the camera moved with it"
-
-
 def test_what_is_remembered_follows_a_correction_of_the_world():
     """As if the world had been the corrected one from the first frame on."""
     correction, sigma = se3.exp(np.array([0.3, -0.1, 0.2, 0.0, 0.1, 0.05])), np.full(CAMERA.shape, 0.01, np.float32)

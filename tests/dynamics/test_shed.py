@@ -4,7 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from test_segments import TOLERANCE, scene
 
+from dudmap.config import DynamicsConfig
+from dudmap.core.dynamics.segments import segment
+from dudmap.core.dynamics.temporal_memory import TemporalMemory
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.shed import Shed
 from dudmap.core.slam import Slam
@@ -52,6 +57,17 @@ def test_work_is_omitted_after_a_gap_that_overload_makes():
     for number in (*range(YOUNG), *range(YOUNG, YOUNG + 20, 2)):
         found.append(slam.process(sequence[number]).shed)
     assert all({one, other} == {Shed.MOVERS, ALL} for one, other in pairwise(found[-8:]))
+
+
+def test_labels_are_carried_while_most_of_a_mover_has_not_left_its_place():
+    memory, (image, board) = TemporalMemory(DynamicsConfig()), scene(0.0)
+    assert not memory.can_carry(image, np.eye(4)), "there is no last frame"
+    memory.update(0.0, image, np.eye(4), np.zeros_like(board), segment(image, TOLERANCE))
+    assert memory.can_carry(image, np.eye(4)), "nothing moves"
+    memory.update(0.1, image, np.eye(4), board, segment(image, TOLERANCE))
+    assert memory.can_carry(scene(0.3)[0], np.eye(4)), "5/8 of the board overlap"
+    assert not memory.can_carry(scene(0.5)[0], np.eye(4)), "3/8 of the board overlap"
+    assert not memory.can_carry(image, se3.exp(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))), "the camera moved with it"
 
 
 def test_two_of_three_frames_omit_most(shed):

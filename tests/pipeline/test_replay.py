@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from dudmap.app.pipeline import frame_source
-from dudmap.app.pipeline.frame_source import CATCH_UP, MAX_DELAY, FrameQueue, SourceFrame, arriving
+from dudmap.app.pipeline.frame_source import CATCH_UP, MAX_DELAY, FrameQueue, FrameRead, SourceFrame, arriving
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import DatasetError
+from dudmap.errors import DatasetError, FrameError
 from dudmap.io.cameras.replay import ReplayCamera
 from dudmap.io.sequences import open_sequence
 from fake_slam import FakeSlam
@@ -64,6 +64,16 @@ def test_a_reader_that_is_too_slow_leaves_frames_out():
     np.testing.assert_allclose(times, 0.1 * np.array(indices), atol=1e-9)
 
 
+def put(queue, number, arrival):
+    queue.put(SourceFrame(number, FrameRead(FrameError("no images"), None, 0.0), arrival=arrival))
+
+
+def take(queue) -> SourceFrame:
+    frame = queue.take()
+    assert frame is not None
+    return frame
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """The time that the queue reads, seconds."""
@@ -76,11 +86,11 @@ def test_only_frames_of_the_last_moment_wait(clock):
     queue = FrameQueue()
     clock[0] = MAX_DELAY / CATCH_UP
     for number, arrived in enumerate([0.0, 0.2, 0.26, 0.29, 0.32]):
-        queue.put(SourceFrame(number, "", arrival=arrived))
-    assert queue.take().number == 2, "that at 0.2 is too old"
-    queue.put(SourceFrame(5, "", arrival=9.0))
+        put(queue, number, arrived)
+    assert take(queue).number == 2, "that at 0.2 is too old"
+    put(queue, 5, 9.0)
     queue.close()
-    assert queue.take().number == 5
+    assert take(queue).number == 5
     assert queue.take() is None
     assert queue.take() is None
 
@@ -95,10 +105,10 @@ def consumed(clock, delays, start=1.1 * MAX_DELAY / CATCH_UP):
         now = max(now + delay, start + arrived / 30 if queue.is_empty else 0)
         while (arrival := start + arrived / 30) <= now:
             clock[0] = arrival
-            queue.put(SourceFrame(arrived, "", arrival=arrival))
+            put(queue, arrived, arrival)
             arrived += 1
         clock[0] = now
-        frame = queue.take()
+        frame = take(queue)
         numbers.append(frame.number)
         ages.append(now - frame.arrival)
     return np.array(numbers), np.array(ages)
@@ -138,11 +148,11 @@ def test_a_consumer_that_is_too_slow_gets_recent_frames(clock):
 
 def test_a_consumer_waits_for_the_next():
     queue, taken = FrameQueue(), []
-    thread = threading.Thread(target=lambda: taken.append(queue.take().read))
+    thread = threading.Thread(target=lambda: taken.append(queue.take()))
     thread.start()
-    queue.put(SourceFrame(0, "late"))
+    put(queue, 7, 0.0)
     thread.join(timeout=5)
-    assert taken == ["late"]
+    assert [frame.number for frame in taken] == [7]
 
 
 def test_a_frame_that_takes_twice_as_long_drops_none():
