@@ -191,10 +191,8 @@ class ParameterOptions:
     assignments: SetOption = None
 
     def read(self, *more: str, seen: "Iterable[Frame]" = ()) -> "Config":
-        """Read the parameters, with assignments ``more``, for ``--range`` or else the range of the frames ``seen``.
-
-        Lengths that ``--config`` or ``--set`` give are not scaled.
-        """
+        """Parameters with assignments ``more``, for ``--range`` or the range of the frames ``seen``, which does not
+        scale given lengths."""
         from dudmap.ranges import RANGES, size_of
 
         if self.range is not None and self.range not in RANGES:
@@ -251,7 +249,7 @@ class MapOptions:
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace arguments of a command that are dataclasses of options by single options."""
+    """Replace dataclasses of options among a command's arguments by single options."""
     signature = inspect.signature(command)
     annotations: dict[str, Any] = {name: found.annotation for name, found in signature.parameters.items()}
     groups: dict[str, Any] = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
@@ -312,10 +310,8 @@ def memory_size(text: str | None) -> int | None:
 
 
 def read_config(file: Path | None, system: str | None, assignments: list[str] | None, size: float = 1.0) -> "Config":
-    """Configuration from a file or the defaults, with the system and single parameters set.
-
-    ``size`` is the size of the scene relative to a room; the thesis' system allows 1 alone.
-    """
+    """Configuration from a file or the defaults, with system and parameters set; ``size``: scene relative to a room, 1
+    for the thesis."""
     from dudmap.config import Config
 
     config = Config.from_tree({}, size) if file is None else Config.load(file, size)

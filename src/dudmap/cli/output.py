@@ -14,20 +14,20 @@ class DefaultGroup(TyperGroup):
     """Command group whose first command is the default: ``dudmap evaluate RUN``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
-        """Insert the first command if the arguments name none."""
+        """Insert the first command if none is named."""
         if args and args[0] not in self.commands and args[0] != "--help":
             args = [next(iter(self.commands)), *args]
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the help of the group, then the help of its first command, whose name is optional."""
+        """Write the help of the group and of its first command, whose name is optional."""
         super().format_help(ctx, formatter)
         name, command = next(iter(self.commands.items()))
         command.format_help(command.context_class(command, info_name=name, parent=ctx), formatter)
 
 
 def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False, out: Path | None = None) -> None:
-    """Print a command's result and output folder to stdout: as one JSON object, as text, or not at all."""
+    """Print result and output folder to stdout: JSON, text, or nothing."""
     if out is not None:
         tree, text = {**tree, "out": out}, f"{text}\nwritten to {out}"
     if as_json:
@@ -37,7 +37,7 @@ def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = F
 
 
 def free_folder(wanted: Path) -> Path:
-    """The folder itself if it is new or empty, else the first of ``<name>-2``, ``<name>-3``, ... that is."""
+    """The folder if new or empty, else the first such ``<name>-2``, ``<name>-3``, ..."""
     folder, number = wanted, 1
     while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         number += 1
@@ -46,10 +46,10 @@ def free_folder(wanted: Path) -> Path:
 
 
 def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
-    """Print the metrics of a run to stdout: as one JSON object, as a table, or not at all.
+    """Print the metrics of a run to stdout: JSON, a table, or nothing.
 
     Raises:
-        typer.Exit: The run is of no use, as the last line on stderr states; the code is ``USELESS``.
+        typer.Exit: The run is of no use; the code is ``USELESS``.
     """
     from dudmap.cli import USELESS, fail
 

@@ -155,7 +155,7 @@ def run(
 def run_parameters(
     parameters: o.ParameterOptions, mapped: o.MapOptions, out: Path | None
 ) -> "tuple[Config, SavedMap | None]":
-    """Configuration and saved map of a run; the default configuration is the saved map's."""
+    """Configuration (default: the saved map's) and saved map of a run."""
     from dudmap.core.backends.device import resolve
     from dudmap.core.places.saved_map import SavedMap
 
@@ -175,7 +175,7 @@ def run_parameters(
 def for_range(
     config: "Config", parameters: o.ParameterOptions, mapped: o.MapOptions, frames: "list[Frame]"
 ) -> "Config":
-    """Configuration for the given range, or for the range of some frames; prints a chosen range."""
+    """Configuration for the given range, or the frames'; prints a chosen range."""
     chosen = _config(parameters, mapped, frames)
     if chosen != config:
         log.info("%s, chosen from the depth images; --range room keeps the defaults of a room", chosen.range_text)

@@ -32,11 +32,8 @@ def view(
 
 @contextmanager
 def observers(wanted: o.WatchingOptions) -> "Iterator[tuple[RunObserver, ...]]":
-    """Yield the wanted observers of a run.
-
-    An unforeseen error becomes one sentence and a report in the run folder. A page stays open after the run until
-    ctrl-C, if the input is a terminal.
-    """
+    """Yield the wanted observers of a run. An unforeseen error becomes a sentence and a report; a page stays open until
+    ctrl-C on a terminal."""
     from dudmap.app.pipeline.observer import EventLog, report_crash
 
     events = EventLog(wanted.log)

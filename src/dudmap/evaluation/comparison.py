@@ -1,4 +1,4 @@
-"""Scores of one or several estimated trajectories against the same true one."""
+"""Scores of estimated trajectories against one true one."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -39,14 +39,14 @@ COLUMNS = (
 
 
 class Named(NamedTuple):
-    """Path of an estimate, and the name of its method."""
+    """Path of an estimate, and its method's name."""
 
     name: str
     path: Path
 
     @classmethod
     def of(cls, text: str) -> "Named":
-        """Parse ``NAME=PATH``, or a path, whose last part without its ending becomes the name."""
+        """Parse ``NAME=PATH``, or a path, whose stem becomes the name."""
         name, equals, path = text.partition("=")
         if equals and name and path and not Path(text).exists():
             return cls(name, Path(path))
@@ -55,10 +55,10 @@ class Named(NamedTuple):
 
 
 class Manner(NamedTuple):
-    """Comparison of estimates with the reference: options of ``dudmap evaluate trajectory``.
+    """Options of ``dudmap evaluate trajectory``.
 
     Attributes:
-        seconds: Offset added to the times of the estimate; None: the best agreement.
+        seconds: Added to the estimate's times; None: best agreement.
     """
 
     formats: tuple[str | None, str | None] = (None, None)
@@ -74,7 +74,7 @@ class Score:
     """An estimate and its errors.
 
     Attributes:
-        found: The estimate after correction of time offset and scale.
+        found: The estimate after time offset and scale.
     """
 
     name: str
@@ -93,7 +93,7 @@ class Score:
 
     @cached_property
     def relative(self) -> RpeResult | None:
-        """Relative errors per second; None if the recording is too short."""
+        """Relative errors per second; None if too short."""
         try:
             return rpe(self.found, self._reference, 1.0, "s", self.manner.max_difference)
         except DatasetError:  # the reason is among the figures
@@ -111,7 +111,7 @@ class Score:
 
 
 def score(estimate: Path, name: str, reference: Path | None, manner: Manner) -> Score:
-    """Score of a run folder or a file of poses against the reference; without one, metrics of the path alone."""
+    """Score of a run folder or poses; without reference, metrics of the path alone."""
     file, run = find_trajectory(estimate)
     truth = find_reference(reference, run)
     estimated, known = load_trajectories(file, truth, manner.formats, manner.clock)
@@ -137,7 +137,7 @@ def compare(estimates: list[Named], reference: Path, manner: Manner) -> list[Sco
     """Scores of several estimates against one reference.
 
     Raises:
-        DatasetError: An estimate cannot be read, or its times do not match the reference.
+        DatasetError: An unreadable estimate, or times that do not match.
         ConfigError: Two estimates have one name.
     """
     names = [estimate.name for estimate in estimates]

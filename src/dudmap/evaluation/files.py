@@ -1,7 +1,4 @@
-"""Input files of an evaluation: trajectory, mesh and reference of a run folder, a recording, or named directly.
-
-Missing or malformed files raise ``DatasetError``, meshes ``MapError``.
-"""
+"""Input files of an evaluation; faults raise ``DatasetError``, meshes ``MapError``."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +20,7 @@ from dudmap.io.sequences.tum import BonnSequence, TumSequence, bonn_camera_poses
 
 
 class TrajectoryFile(NamedTuple):
-    """Path of a trajectory, and the run folder it belongs to (None if the file was named directly)."""
+    """Path of a trajectory, and its run folder, if any."""
 
     path: Path
     run: Path | None
@@ -40,10 +37,10 @@ def find_trajectory(estimate: Path) -> TrajectoryFile:
 
 
 def find_reference(reference: Path | None, run: Path | None) -> Path | None:
-    """True trajectory: a file, a recording, or without ``reference`` the groundtruth.txt of the run folder.
+    """True trajectory: a file, a recording, or without ``reference`` the run's groundtruth.txt.
 
     Returns:
-        A file, or the folder or archive of a recording whose format has its ground truth in other files.
+        A file, or a recording whose format has its ground truth elsewhere.
     """
     if reference is not None:
         path = reference / "groundtruth.txt" if reference.is_dir() else reference
@@ -57,14 +54,14 @@ def find_reference(reference: Path | None, run: Path | None) -> Path | None:
 
 
 class Loaded(NamedTuple):
-    """A trajectory, and the name of its format for messages."""
+    """A trajectory and its format's name."""
 
     trajectory: Trajectory
     format: str
 
 
 class Clock(NamedTuple):
-    """Times of poses without times: a file with a time in each row or a recording, or a rate in 1/s."""
+    """Times for poses without: a file, a recording, or a rate in 1/s."""
 
     times: Path | None = None
     fps: float | None = None
@@ -76,8 +73,7 @@ BONN = "bonn"
 def load_reference(path: Path) -> Trajectory:
     """True camera poses of a path from ``find_reference``.
 
-    The groundtruth.txt of a recording is read by its format, because some data sets store marker poses, robot poses or
-    other axes.
+    A recording's groundtruth.txt is read by its format, because some have markers, robots or other axes.
     """
     return _with_times(path, _read_reference(path, None), None, Clock()).trajectory
 
@@ -90,15 +86,15 @@ def load_trajectories(
 ) -> tuple[Loaded, Loaded | None]:
     """Estimate, and true camera poses of a path from ``find_reference``.
 
-    Poses without times (KITTI) take the times of ``clock``, else of the reference's recording, else of the other
-    trajectory, if the numbers match.
+    Poses without times (KITTI) take the times of ``clock``, the reference's recording, or the other trajectory, if the
+    numbers match.
 
     Args:
-        formats: Names of both formats, of ``pose_files.FORMATS`` or ``bonn``; None: recognised.
+        formats: Of ``pose_files.FORMATS`` or ``bonn``; None: recognised.
 
     Raises:
-        ConfigError: The name of a format is unknown, or ``clock`` has two sources or is not needed.
-        DatasetError: A file or recording cannot be read, its format is not clear, or poses lack times.
+        ConfigError: An unknown format, or ``clock`` has two sources or is not needed.
+        DatasetError: An unreadable file or recording, an unclear format, or no times.
     """
     found = _Read(*_poses(estimate, formats[0], "--format"), None)
     true = None if reference is None else _read_reference(reference, formats[1])
@@ -114,14 +110,11 @@ def load_trajectories(
 
 
 class _Read(NamedTuple):
-    """Poses as read, the name of their format, and their recording, if any."""
-
     file: PoseFile
     format: str
     recording: Path | None
 
     def known_times(self) -> list[NDArray[np.float64]]:
-        """Times of the frames of the recording, and of the poses."""
         try:
             frames = None if self.recording is None else open_sequence(self.recording).timestamps
         except DatasetError:  # the frames are only one source of times
@@ -130,7 +123,7 @@ class _Read(NamedTuple):
 
 
 def _poses(path: Path, name: str | None, option: str) -> tuple[PoseFile, str]:
-    """Poses of a file without invalid rows, and their format; Bonn's marker poses become camera poses."""
+    """Bonn's marker poses become camera poses."""
     file = read_poses(path, "tum" if name == BONN else name, optional=True, option=option)
     if name != BONN:
         return file, file.format.name
@@ -154,7 +147,6 @@ def _read_reference(path: Path, name: str | None) -> _Read:
 
 
 def _with_times(path: Path, read: _Read, other: _Read | None, clock: Clock) -> Loaded:
-    """Trajectory of poses with their own times, or those of ``load_trajectories``."""
     file, count = read.file, len(read.file.Ts_world_camera)
     if file.timestamps is not None:
         return Loaded(_trajectory(path, file.timestamps, file), read.format)
@@ -203,7 +195,7 @@ class TrueSurface(NamedTuple):
 
 
 def true_surface(folder: Path) -> TrueSurface | None:
-    """True surface of a folder: surface.ply with perhaps surface_observed.ply, or the model of its data set."""
+    """surface.ply with perhaps surface_observed.ply, or the data set's model."""
     path, seen = folder / "surface.ply", folder / "surface_observed.ply"
     if path.is_file():
         observed = load_mesh(seen) if seen.is_file() else None
@@ -220,8 +212,8 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | None:
-    """Rigid motion (4, 4) of a run's first pose onto the true one, or None. All positions of a short path would
-    hardly determine the rotation of the map."""
+    """Motion (4, 4) of a run's first pose onto the true one, or None; all positions of a short path hardly determine
+    the rotation."""
     estimate, truth = run / "trajectory.txt", _truth_in(recording)
     if truth is None or not estimate.is_file():
         return None
@@ -235,8 +227,7 @@ def _truth_in(recording: Path) -> Trajectory | None:
 
 
 def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float | None:
-    """Share of the recording's frames that have a pose, or None; frames are counted by metrics.json or by image
-    lists."""
+    """Share of the recording's frames with a pose, or None; frames by metrics.json or lists."""
     frames = _num_frames(run, reference)
     return round(poses / frames, 6) if frames else None
 

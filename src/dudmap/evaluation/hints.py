@@ -1,4 +1,4 @@
-"""Causes of trajectory errors other than the estimate: different clocks, or poses of another body."""
+"""Causes of trajectory errors besides the estimate: clocks, or poses of another body."""
 
 from math import degrees
 
@@ -9,11 +9,11 @@ from dudmap.evaluation.time_offset import LARGEST_HINT, MotionComparison
 from dudmap.evaluation.trajectory import adjusted, ate, body_rotation
 
 EXPLAINED = 0.5
-"""Largest remaining share of an error that a cause explains; noise is not halved by one to three degrees of freedom."""
+"""Largest remaining share of an explained error, below noise's by three degrees of freedom."""
 
 
 def hints(estimate: Trajectory, reference: Trajectory, max_difference: float) -> list[str]:
-    """Sentences on causes that explain at least half of the error, with the option that removes each."""
+    """Sentences on causes of at least half of the error, and their options."""
     found = _of_time(estimate, reference, max_difference), _of_body(estimate, reference, max_difference)
     return [hint for hint in found if hint]
 

@@ -1,7 +1,4 @@
-"""Plots of trajectory, surface and mask errors. Each function writes one file: PNG, PDF or SVG, by its ending.
-
-A failed write raises ``DudmapError``.
-"""
+"""Plots of trajectory, surface and mask errors: PNG, PDF or SVG, by ending. A failed write raises ``DudmapError``."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -27,11 +24,11 @@ if TYPE_CHECKING:
 ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
 COLORS = ESTIMATE, SECOND, "#2e8b57", "#d98a00", "#7b4fa3", "#14949b", "#8c564b", "#d65fa5"
 LEGEND: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 1), "ncols": 2, "frameon": False}
-"""Above the axes on the right; titles are on the left."""
+"""Above the axes on the right."""
 
 
 def plot_trajectories(path: Path, scores: list[Score]) -> None:
-    """Aligned estimates and the reference: seen along the direction of least motion, and each axis over time."""
+    """Aligned estimates and reference: along the direction of least motion, and each axis over time."""
     true, t0 = _compared_reference(scores)
     figure, places = _figure_of([["view", axis] for axis in "xyz"], (13, 5.5), width_ratios=[1.1, 1])
     positions = true.Ts_world_camera[:, :3, 3]
@@ -65,7 +62,7 @@ def plot_errors(path: Path, scores: list[Score]) -> None:
 
 
 def plot_relative_errors(path: Path, scores: list[Score]) -> bool:
-    """Plot relative errors over time of the estimates that have them; returns whether there are any."""
+    """Plot relative errors over time; returns whether there are any."""
     found = [(score.name, score.relative) for score in scores if score.relative is not None]
     labels = "translation, mm over 1 s", "rotation, deg over 1 s", "time of the first pose, s"
     if found:
@@ -74,7 +71,7 @@ def plot_relative_errors(path: Path, scores: list[Score]) -> bool:
 
 
 def plot_error_paths(path: Path, scores: list[Score]) -> None:
-    """Position error as colour along the aligned path of each estimate; one scale for all."""
+    """Position error as colour along each path; one scale."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -124,7 +121,6 @@ def _plot_errors(
 
 
 def _compared_reference(scores: list[Score]) -> tuple[Trajectory, float]:
-    """The reference within the compared part, and the start of this part."""
     start, end = (f(g(score.absolute.timestamps) for score in scores) for f, g in ((min, np.min), (max, np.max)))
     true = scores[0].true
     assert true is not None
@@ -153,8 +149,8 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
     """Histogram of the registration residuals with the fitted mixture.
 
     Args:
-        residuals: NPZ file: ``edges`` (B + 1,) in standard deviations of the measurement, ``counts`` (B,), and a
-            mixture of two half-normal densities (static, dynamic): ``prior`` (2,), ``sigma`` (2,).
+        residuals: NPZ file: ``edges`` (B + 1,), standard deviations, ``counts`` (B,), ``prior`` (2,) and ``sigma`` (2,)
+            of half-normal densities, static and dynamic.
     """
     try:
         with open_arrays(residuals) as data:
@@ -177,7 +173,7 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
 
 
 def plot_surface(path: Path, result: SurfaceResult) -> None:
-    """Histograms of accuracy and completeness, and their cumulative shares."""
+    """Histograms of accuracy and completeness, and cumulative shares."""
     figure, (histogram, cumulated) = _figure(2, width=13)
     edges, width = 1000 * result.histogram_edges, 1000 * float(np.diff(result.histogram_edges[:2])[0])
     rows = (
@@ -204,7 +200,7 @@ def plot_surface(path: Path, result: SurfaceResult) -> None:
 
 
 def plot_masks(path: Path, result: MaskResult) -> None:
-    """Precision, recall and intersection over union, and the true and estimated dynamic shares, over time."""
+    """Precision, recall, intersection over union, true and estimated dynamic shares over time."""
     figure, (quality, shares) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
     scored = result.coverage > SCORED_COVERAGE

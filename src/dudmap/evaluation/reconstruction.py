@@ -1,9 +1,9 @@
-"""Comparison of a reconstructed surface with the true one: accuracy, completeness and ghosts.
+"""Comparison of a surface with the true one: accuracy, completeness, ghosts.
 
-Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other.
+Uniform points of one surface are measured to the nearest triangle of the other.
 
-Errors: ``MapError`` for a mesh with NaN or without faces (unless point clouds are accepted); ``ConfigError`` for a
-distance or number of samples that is not positive.
+``MapError``: NaN, or no faces (unless point clouds are accepted); ``ConfigError``: a distance or number that is not
+positive.
 """
 
 from collections.abc import Iterable
@@ -22,12 +22,11 @@ Distances = NDArray[np.float32]
 
 THRESHOLDS = (0.01, 0.02, 0.05)
 GHOST_DISTANCE = 0.05
-"""Distance from the true surface beyond which estimated surface is a ghost, metres: more than noise and a band of a
-few voxels, less than an arm."""
+"""Distance of ghosts from the true surface, metres: between noise and an arm."""
 SAMPLES = 300_000
-"""Points sampled on each surface: the standard error of a share of 1 % is at most 0.02 %."""
+"""Points sampled on each surface: a share of 1 % errs by 0.02 %."""
 HISTOGRAM_LARGEST, HISTOGRAM_BINS = 0.2, 100
-"""Bins of 2 mm up to 0.2 m; the last bin also counts everything beyond."""
+"""Bins of 2 mm; the last also counts everything beyond."""
 
 
 class ThresholdScore(NamedTuple):
@@ -48,11 +47,10 @@ class SurfaceResult:
     """Comparison of an estimated surface with the true one. Areas of a point cloud are None.
 
     Attributes:
-        area_m2, reference_area_m2, ghost_area_m2: Area of the estimate, of the reference for completeness, and of the
-            ghosts.
-        ghost_distance: Distance from the reference beyond which the estimate is a ghost, metres.
-        histogram_edges: (B + 1,) metres; the last bin also counts everything beyond.
-        accuracy_histogram, completeness_histogram: (B,) share of the estimate, and of the reference, per bin.
+        area_m2, reference_area_m2, ghost_area_m2: Of the estimate, the reference for completeness, the ghosts.
+        ghost_distance: Metres.
+        histogram_edges: (B + 1,) metres.
+        accuracy_histogram, completeness_histogram: (B,) shares per bin.
     """
 
     accuracy: Statistics
@@ -98,13 +96,13 @@ def compare_surfaces(
     """Accuracy, completeness, F-scores and ghosts of an estimated surface.
 
     Args:
-        estimate: The reconstruction, in the reference's frame.
-        reference: The true static surface, for accuracy and ghosts.
-        observed: The part of it that the camera saw, for completeness; None for all of it.
-        thresholds: Distances in metres for precision, recall and F-score.
-        ghost_distance: Distance from the true surface beyond which estimated surface is a ghost, metres.
-        samples: Number of points sampled on each surface.
-        points: Accept point clouds, whose points serve as samples.
+        estimate: In the reference's frame.
+        reference: True static surface.
+        observed: Part that the camera saw, for completeness; None for all.
+        thresholds: Metres, for precision, recall and F-score.
+        ghost_distance: Metres.
+        samples: Points on each surface.
+        points: Accept point clouds as samples.
     """
     thresholds = tuple(thresholds)
     _check_positive("samples", samples)
@@ -145,14 +143,14 @@ def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
 
 
 def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
-    """The estimate, each vertex coloured by its distance to the reference: blue at 0 to red at ``largest`` metres."""
+    """The estimate, coloured by its distance to the reference: blue at 0 to red at ``largest`` metres."""
     _check_positive("the distance at the end of the colour scale", largest)
     distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)
     return Mesh(estimate.vertices, estimate.faces, distance_colors(distances, largest), estimate.normals)
 
 
 def distance_colors(distances: Distances, largest: float) -> NDArray[np.uint8]:
-    """Colours (N, 3) from blue at 0 through green and yellow to red at ``largest`` and beyond."""
+    """Colours (N, 3) from blue at 0 to red at ``largest``."""
     anchors = np.array([[40, 70, 200], [40, 170, 190], [90, 190, 70], [240, 210, 50], [210, 40, 30]], dtype=np.float64)
     at = np.clip(np.nan_to_num(distances.astype(np.float64), nan=largest) / largest, 0, 1) * (len(anchors) - 1)
     steps = np.arange(len(anchors))

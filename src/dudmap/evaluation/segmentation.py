@@ -19,11 +19,11 @@ Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SCORED_COVERAGE = 0.05
-"""Share of the image above which a frame counts for the mean intersection over union."""
+"""Smallest true share of the image that counts for the mean intersection over union."""
 
 
 class MaskPair(NamedTuple):
-    """Timestamp in seconds, estimated and true dynamic mask (H, W) of one frame."""
+    """Timestamp in seconds, estimated and true mask (H, W)."""
 
     timestamp: float
     estimate: Mask
@@ -32,17 +32,17 @@ class MaskPair(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MaskResult:
-    """Comparison of estimated with true dynamic masks over N frames. A ratio over no pixels is NaN.
+    """Estimated against true dynamic masks of N frames; NaN for no pixels.
 
     Attributes:
         timestamps: (N,) seconds.
-        coverage: (N,) dynamic share of the image in the true mask.
-        found_share: (N,) dynamic share of the image in the estimated mask.
-        precision: (N,) share of the estimated mask that is in the true mask.
-        recall: (N,) share of the true mask that is in the estimated mask.
+        coverage: (N,) dynamic share of the image, true.
+        found_share: (N,) dynamic share of the image, estimated.
+        precision: (N,) share of the estimated mask in the true one.
+        recall: (N,) share of the true mask in the estimated one.
         iou: (N,) intersection over union.
-        mean_iou: Mean of ``iou`` over the frames whose ``coverage`` exceeds ``SCORED_COVERAGE``.
-        false_alarm_share: Mean ``found_share`` over the frames with an empty true mask.
+        mean_iou: Over frames with ``coverage`` above ``SCORED_COVERAGE``.
+        false_alarm_share: Mean ``found_share`` of frames with an empty true mask.
     """
 
     timestamps: Numbers
@@ -61,16 +61,16 @@ class MaskResult:
 
 
 def mask_iou(estimate: Mask, reference: Mask) -> float:
-    """Intersection over union of two masks (H, W), of which at least one is not empty."""
+    """Intersection over union of two masks (H, W), not both empty."""
     return np.count_nonzero(estimate & reference) / np.count_nonzero(estimate | reference)
 
 
 def compare_masks(pairs: Iterable[MaskPair], num_missing: int = 0) -> MaskResult:
-    """Precision, recall and intersection over union of all pixels, per frame and over all frames.
+    """Precision, recall and intersection over union, per frame and over all.
 
     Args:
-        pairs: Estimated and true masks of the same frames.
-        num_missing: Number of true masks without a partner; copied to the result.
+        pairs: Estimated and true masks.
+        num_missing: True masks without partner, for the result.
 
     Raises:
         DatasetError: There is no pair, or two masks differ in size.
@@ -109,15 +109,14 @@ def compare_masks(pairs: Iterable[MaskPair], num_missing: int = 0) -> MaskResult
 
 
 def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int]:
-    """Estimated masks of a run and the true ones, paired by time and read one after the other.
+    """Estimated and true masks, paired by time and read one by one.
 
     Args:
-        estimate: Run folder with masks/, or a folder of PNG files named by time stamp.
-        reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by time stamps or by image
-            numbers.
+        estimate: Run folder, or PNG files named by time stamp.
+        reference: TUM layout with mask.txt, or PNG files named by time stamps or image numbers.
 
     Returns:
-        The pairs, and the number of true masks without an estimated one.
+        The pairs, and the number of unpaired true masks.
 
     Raises:
         DatasetError: A folder holds no masks, or no two masks are close enough in time.
@@ -136,7 +135,6 @@ def mask_pairs(estimate: Path, reference: Path) -> tuple[Iterator[MaskPair], int
 
 
 def _true_masks(folder: Path) -> list[tuple[float, Path]]:
-    """Timestamps and files of the true masks; depth timestamps if there is an associations.txt."""
     if not (folder / "mask.txt").is_file():
         return _estimated_masks(folder)
     masks = read_list(folder / "mask.txt")
@@ -149,7 +147,6 @@ def _true_masks(folder: Path) -> list[tuple[float, Path]]:
 
 
 def _numbered_masks(folder: Path, run: Path) -> list[tuple[float, Path]]:
-    """Timestamps and files of masks named by image numbers of a run's recording."""
     try:
         recording = open_sequence(**read_json(run / "metrics.json")["recording"])
     except (DudmapError, *DAMAGE) as error:

@@ -1,4 +1,4 @@
-"""Surfaces for sampling of points and measurement of distances, and the rigid registration of two surfaces."""
+"""Surfaces for sampling and distances, and registration of two surfaces."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,24 +18,23 @@ Points = NDArray[np.float32]
 
 CANDIDATES = 4
 ANCHORS = 400_000
-"""Number of additional anchors on large triangles, over the whole surface."""
+"""Additional anchors on large triangles."""
 BATCH = 200_000
 OVERLAP, REACH, ITERATIONS = 0.8, 0.3, 60
-"""Registration: share of the estimate with a counterpart, largest distance of a pair (m), largest number of
-iterations."""
+"""Registration: share of the estimate with a counterpart, largest distance of a pair (m), iterations."""
 
 
 class Surface:
-    """A triangle mesh, or point cloud if allowed, for sampling of points and measurement of distances.
+    """A triangle mesh, or point cloud if allowed.
 
     Args:
-        mesh: The mesh; faces without area are ignored.
+        mesh: Faces without area are ignored.
 
     Attributes:
         area: Square metres; None for a point cloud.
 
     Raises:
-        MapError: The mesh is empty, has NaN, or has no faces and ``points`` is not set.
+        MapError: Empty, NaN, or no faces and not ``points``.
     """
 
     def __init__(self, mesh: Mesh, name: str, *, points: bool = False) -> None:
@@ -66,10 +65,7 @@ class Surface:
         return self.area is None
 
     def samples(self, count: int, seed: int = 0) -> Points:
-        """Points (count, 3) distributed uniformly over the area; of a point cloud, ``count`` of its points.
-
-        One point per equal share of the area: less variance, and ten times faster than ``trimesh.sample``.
-        """
+        """Points (count, 3), one per equal share of the area; of a point cloud, ``count`` of its points."""
         random = np.random.default_rng(seed)
         if self.is_cloud:
             chosen = random.choice(len(self._vertices), count, replace=count > len(self._vertices))
@@ -82,8 +78,8 @@ class Surface:
     def distances(self, points: Points) -> NDArray[np.float32]:
         """Distances (N,) of points (N, 3) to the surface, metres.
 
-        Exact for the triangles of the nearest anchors. Every triangle has an anchor at its centroid, large ones have
-        more. A nearer triangle is missed only by less than the anchor spacing.
+        Exact for the triangles of the nearest anchors: centroids, and more on large triangles. A nearer one is missed
+        by less than the anchor spacing.
         """
         out = np.empty(len(points), np.float32)
         for start in range(0, len(points), BATCH):
@@ -122,7 +118,7 @@ class Surface:
         return KDTree(self._anchors[0], balanced_tree=False, compact_nodes=False)
 
     def nearest_planes(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
-        """Distance (N,) to the nearest anchor, the anchor (N, 3) and the normal (N, 3) of its triangle."""
+        """Distance (N,) to the nearest anchor, the anchor (N, 3) and its normal (N, 3)."""
         distance, nearest = self._tree.query(points, workers=-1)
         anchors, faces = self._anchors
         normals = self._normals[faces[nearest]] if not self.is_cloud else np.zeros_like(points)
@@ -130,7 +126,6 @@ class Surface:
 
 
 def _inside(corners: Points, random: np.random.Generator) -> Points:
-    """One point per triangle (N, 3, 3), uniform over its area (Turk 1990)."""
     a, b = np.sqrt(random.random(len(corners), np.float32)), random.random(len(corners), np.float32)
     weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
     return np.einsum("nk,nkd->nd", weights, corners)
@@ -148,9 +143,9 @@ class SurfaceAlignment:
     """Result of the registration of two surfaces.
 
     Attributes:
-        T_reference_estimate: (4, 4) rigid motion of the estimate onto the reference.
-        rmse: Root mean square of the point-to-plane distances of the inliers in the last iteration, metres.
-        free_directions: Number of the six degrees of freedom that the surfaces do not determine; they stay fixed.
+        T_reference_estimate: (4, 4).
+        rmse: Point-to-plane, of the last inliers, metres.
+        free_directions: Undetermined degrees of freedom, which stay fixed.
     """
 
     T_reference_estimate: NDArray[np.float64]
@@ -162,13 +157,11 @@ class SurfaceAlignment:
 def register(
     estimate: Mesh, reference: Mesh, T_reference_estimate: NDArray[np.float64] | None = None, *, samples: int = 30_000
 ) -> SurfaceAlignment:
-    """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
-
-    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, and none beyond ``REACH``.
-    Ghosts and missing parts thus have no influence.
+    """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002) of the share ``OVERLAP``
+    within ``REACH``, without ghosts and missing parts.
 
     Raises:
-        MapError: A mesh has no faces, or too few points lie within ``REACH``.
+        MapError: No faces, or too few points within ``REACH``.
     """
     target = Surface(reference, "the reference")
     points = Surface(estimate, "the estimate").samples(samples).astype(np.float64)

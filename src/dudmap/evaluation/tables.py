@@ -1,4 +1,4 @@
-"""Tables of metrics: Markdown, CSV, and LaTeX with the rules of the package booktabs."""
+"""Tables of metrics: Markdown, CSV, LaTeX (booktabs)."""
 
 import csv
 import io
@@ -15,7 +15,7 @@ Row = dict[str, Any]
 
 
 class Column(NamedTuple):
-    """Format of one metric: heading with unit, factor from the stored unit, number of decimals."""
+    """Heading with unit, factor, and decimals of a metric."""
 
     key: str
     heading: str
@@ -31,7 +31,7 @@ def shown(value: Any, column: Column) -> str:  # noqa: ANN401 - figures and word
 
 
 def grid(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
-    """Markdown table; the first ``words`` columns are left-aligned, the others right-aligned."""
+    """Markdown table; the first ``words`` columns are left-aligned."""
     lines = ["| " + " | ".join(header) + " |"]
     lines.append("|" + "|".join("---" if number < words else "---:" for number in range(len(header))) + "|")
     lines += ["| " + " | ".join(row) + " |" for row in rows]
@@ -39,7 +39,7 @@ def grid(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
 
 
 def comma_separated(rows: list[dict[str, Any]]) -> str:
-    """CSV with one column for each key, in stored units."""
+    """CSV with a column per key, in stored units."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), lineterminator="\n")
     writer.writeheader()
@@ -48,7 +48,7 @@ def comma_separated(rows: list[dict[str, Any]]) -> str:
 
 
 def latex(header: Cells, rows: Iterable[Cells], words: int = 2) -> str:
-    """LaTeX ``tabular`` with the rules of booktabs; alignment as in ``grid``."""
+    """LaTeX ``tabular`` (booktabs), aligned as ``grid``."""
     head, *body = (" & ".join(map(_in_latex, cells)) + r" \\" for cells in (header, *rows))
     lines = [r"\begin{tabular}{" + "l" * words + "r" * (len(header) - words) + "}", r"\toprule", head, r"\midrule"]
     return "\n".join([*lines, *body, r"\bottomrule", r"\end{tabular}"]) + "\n"
@@ -60,10 +60,7 @@ def _in_latex(text: str) -> str:
 
 
 def table(rows: list[dict[str, Any]], columns: Iterable[Column], kind: str, words: int = 1) -> str:
-    """Table of rows in a format of ``FORMATS``, without empty columns.
-
-    CSV has every metric under its key, in stored units.
-    """
+    """Table in a format of ``FORMATS``, without empty columns; CSV has every metric in stored units."""
     if kind not in FORMATS:
         raise ConfigError(f"found --table-format {kind}; expected {', '.join(FORMATS)}")
     if kind == "csv":

@@ -1,4 +1,4 @@
-"""Time offset between two trajectories of one camera, estimated from its motion."""
+"""Time offset between two trajectories of one camera, from its motion."""
 
 from typing import NamedTuple
 
@@ -13,26 +13,26 @@ from dudmap.errors import DatasetError
 Numbers = NDArray[np.float64]
 
 STEP = LARGEST_STEP / 3
-"""Step between the offsets of the first search, seconds: three within a time of steady motion."""
+"""Step of the first search, seconds: three within steady motion."""
 GRID = STEP / 5
-"""Step between the times of the reference's rotations, seconds: the rate of motion capture."""
+"""Step of the reference's rotations, seconds: motion capture."""
 WINDOW = 2 * LARGEST_STEP
-"""Time over which rotations are compared, seconds."""
+"""Time of compared rotations, seconds."""
 SAMPLES = 300
-"""Largest number of compared poses of the estimate; temporal neighbours are not independent."""
+"""Compared poses of the estimate."""
 SMALLEST_OVERLAP = 0.5
-"""Smallest share of the estimate within the time of the reference; short parts agree by chance."""
+"""Smallest share of the estimate within the reference's time."""
 CHUNK = 1000
 """Offsets compared at a time: 30 MB."""
 LARGEST_HINT = CHUNK * STEP / 2
-"""Largest offset searched for a hint, seconds: the search takes 0.2 s."""
+"""Largest offset for a hint, seconds: 0.2 s of search."""
 
 
 class TimeOffset(NamedTuple):
-    """Seconds to add to the times of the estimate, and the share of the motion that it leaves unexplained.
+    """Seconds to add to the estimate, and unexplained share of the motion:
 
-    ``unexplained`` is ``1 - r^2``: 0 for equal motions, 1 for unrelated ones. The correlation r is of the aligned
-    positions or of the angles of rotation; the mean of both if both are defined.
+    ``1 - r^2``, 0 for equal motions, 1 for unrelated ones, with the correlation r of aligned positions or angles of
+    rotation, or the mean of both.
     """
 
     seconds: float
@@ -40,10 +40,10 @@ class TimeOffset(NamedTuple):
 
 
 class MotionComparison:
-    """Compares the motions of two trajectories at any time offset, independent of world frame, body frame and scale.
+    """Compares motions at any time offset, independent of world frame, body frame and scale.
 
     Raises:
-        DatasetError: A trajectory has fewer than two poses.
+        DatasetError: Fewer than two poses.
     """
 
     def __init__(self, estimate: Trajectory, reference: Trajectory) -> None:
@@ -58,10 +58,10 @@ class MotionComparison:
         self.grid_turns = _turns(reference, self.grid)
 
     def best(self, largest: float = np.inf) -> TimeOffset:
-        """Best offset of at most ``largest`` seconds that leaves half of the estimate within the reference's time.
+        """Best offset of at most ``largest`` seconds with half of the estimate in the reference's time.
 
         Raises:
-            DatasetError: There is no such offset, or one of the trajectories does not move.
+            DatasetError: No such offset, or no motion.
         """
         start, stop = self.reference.timestamps[0] - self.times[-1], self.reference.timestamps[-1] - self.times[0]
         offsets = np.arange(max(start, -largest), min(stop, largest) + STEP, STEP)
@@ -78,11 +78,10 @@ class MotionComparison:
         return TimeOffset(seconds, self.at(seconds))
 
     def at(self, seconds: float) -> float:
-        """Share of the motion that an offset leaves unexplained; infinite if it cannot be computed."""
+        """Unexplained share of the motion; infinite if unknown."""
         return float(self._unexplained(np.array([seconds]))[0])
 
     def _unexplained(self, offsets: Numbers) -> Numbers:
-        """``at`` for offsets (M,)."""
         known = self.reference.timestamps
         times = self.times + offsets[:, None]
         weights = ((times >= known[0]) & (times <= known[-1])).astype(np.float64)
@@ -101,7 +100,6 @@ class MotionComparison:
 
 
 def _unrelated(a: Numbers, b: Numbers, weights: Numbers) -> Numbers:
-    """``1 - r^2`` of points (M, K, d) with weights (M, K) at the best rotation (Umeyama 1991); NaN without motion."""
     total = np.maximum(weights.sum(axis=1), 1)[:, None, None]
     w = weights[..., None]
     a, b = (w * (points - (w * points).sum(axis=1, keepdims=True) / total) for points in (a, b))
@@ -117,7 +115,7 @@ def _unrelated(a: Numbers, b: Numbers, weights: Numbers) -> Numbers:
 
 
 def _turns(trajectory: Trajectory, times: Numbers) -> Numbers:
-    """Angles (N,) by which the camera turns in ``WINDOW`` seconds after given times, radians; NaN near the end."""
+    """NaN near the end."""
     Ts, stamps = trajectory.Ts_world_camera, trajectory.timestamps
     motions = se3.log_all(se3.inverse(Ts[:-1]) @ Ts[1:])
 

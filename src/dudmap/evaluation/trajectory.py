@@ -1,8 +1,7 @@
 """Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V).
 
-Poses of the ``estimate`` and the true ``reference`` map the camera to the world. They are paired up to
-``max_difference`` seconds apart. Errors: ``DatasetError`` for no overlap in time or fewer than three pairs;
-``ConfigError`` for invalid arguments.
+Poses of ``estimate`` and ``reference``, camera to world, are paired up to ``max_difference`` seconds apart.
+``DatasetError``: no overlap in time or fewer than three pairs; ``ConfigError``: invalid arguments.
 """
 
 import math
@@ -25,21 +24,21 @@ Unit = Literal["s", "m"]
 
 FEWEST_PAIRS = 3
 SMALLEST_SHARE = 0.1
-"""Smallest share of the shorter trajectory's poses with a partner; fewer do not describe its path."""
+"""Smallest share of the shorter trajectory's poses with a partner."""
 SMALLEST_SPREAD = 1e-3
-"""Smallest spread of positions across their principal direction (metres, and share of the spread along it) that
-determines a rotation."""
+"""Smallest spread of positions across their direction (metres, and share of the spread along) that determines a
+rotation."""
 LONGEST_STEP = 3.0
-"""Median time steps between consecutive poses beyond which frames were lost."""
+"""Median time steps after which frames were lost."""
 PATH_TOLERANCE = 0.1
-"""Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
+"""Relative tolerance of ``delta`` in metres."""
 
 
 STATISTICS = "rmse", "mean", "median", "max"
 
 
 class Statistics(NamedTuple):
-    """Root mean square, mean, median, maximum and 95 % quantile of errors, in their unit."""
+    """Root mean square, mean, median, maximum and 95 % quantile."""
 
     rmse: float
     mean: float
@@ -57,12 +56,12 @@ class Statistics(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of N poses, or of the motions between N pairs of poses.
+    """Errors of N poses, or of motions between N pairs.
 
     Attributes:
-        timestamps: (N,) seconds, of the estimate; for a motion, of its first pose.
-        trans_errors: (N,) lengths of the translations of the errors, metres.
-        rot_errors_deg: (N,) angles of their rotations, degrees.
+        timestamps: (N,) seconds, of the estimate; of a motion's first pose.
+        trans_errors: (N,) translations, metres.
+        rot_errors_deg: (N,) rotations, degrees.
     """
 
     timestamps: Numbers
@@ -71,7 +70,7 @@ class PoseErrors:
 
     @classmethod
     def of(cls, timestamps: Numbers, E: Numbers, *more: Any) -> Self:  # noqa: ANN401
-        """Errors from rigid motions E (N, 4, 4); ``more`` are the fields of the class itself."""
+        """Errors from rigid motions E (N, 4, 4); ``more``: fields of the class."""
         return cls(timestamps, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(se3.rotation_angles(E)), *more)
 
     @property
@@ -100,9 +99,9 @@ class AteResult(PoseErrors):
     """Absolute trajectory error.
 
     Attributes:
-        T_reference_estimate: (4, 4) rigid motion that was applied to the estimate.
-        alignment: ``se3``, ``origin``, ``none``, or ``se3-orientations``: the positions (equal or collinear) do not
-            determine the rotation.
+        T_reference_estimate: (4, 4) applied to the estimate.
+        alignment: ``se3``, ``origin``, ``none``, or ``se3-orientations`` for positions that do not determine the
+            rotation.
     """
 
     T_reference_estimate: Numbers
@@ -111,11 +110,11 @@ class AteResult(PoseErrors):
 
 @dataclass(frozen=True, eq=False)
 class RpeResult(PoseErrors):
-    """Relative pose error over a fixed interval of time or path length.
+    """Relative pose error over a fixed time or path length.
 
     Attributes:
-        delta: Length of the interval.
-        unit: Unit of the interval.
+        delta: Interval.
+        unit: Its unit.
     """
 
     delta: float
@@ -123,7 +122,7 @@ class RpeResult(PoseErrors):
 
 
 class PosePairs(NamedTuple):
-    """Poses associated by time: (N,) timestamps of the estimate and (N, 4, 4) poses of estimate and reference."""
+    """Associated poses: (N,) timestamps of the estimate, (N, 4, 4) of both."""
 
     timestamps: Numbers
     Ts_estimate: Numbers
@@ -131,7 +130,7 @@ class PosePairs(NamedTuple):
 
 
 def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP) -> PosePairs:
-    """Associate the poses of two trajectories one to one, closest timestamps first."""
+    """Associate poses one to one, closest timestamps first."""
     for name, trajectory in (("estimated", estimate), ("reference", reference)):
         if not len(trajectory):
             raise DatasetError(f"the {name} trajectory holds no pose; nothing can be compared")
@@ -144,7 +143,7 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
 
 
 def _unpaired(pairs: int, estimate: Trajectory, reference: Trajectory, max_difference: float) -> str:
-    """Sentence on too few poses that match in time, with the option to try."""
+    """Sentence on too few matching poses, with the option to try."""
     shortest = min(len(estimate), len(reference))
     if shortest < FEWEST_PAIRS:
         mend = f"give a trajectory of at least {FEWEST_PAIRS} poses"
@@ -160,10 +159,10 @@ def _unpaired(pairs: int, estimate: Trajectory, reference: Trajectory, max_diffe
 
 
 def fit_scale(estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP) -> float:
-    """Scale that brings the positions of the estimate closest to the reference's (Umeyama 1991, eq. 42).
+    """Scale of the estimate's positions to the reference's (Umeyama 1991, eq. 42).
 
     Raises:
-        DatasetError: The trajectories do not match in time, or one of them does not move.
+        DatasetError: No match in time, or no motion.
     """
     _, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
@@ -177,7 +176,7 @@ def fit_scale(estimate: Trajectory, reference: Trajectory, max_difference: float
 
 
 def adjusted(estimate: Trajectory, seconds: float = 0.0, scale: float = 1.0) -> Trajectory:
-    """Trajectory with ``seconds`` added to its times and its positions multiplied by ``scale``."""
+    """Trajectory with ``seconds`` added and positions times ``scale``."""
     Ts = estimate.Ts_world_camera.copy()
     Ts[:, :3, 3] *= scale
     return Trajectory(estimate.timestamps + seconds, Ts)
@@ -188,12 +187,12 @@ def ate(
 ) -> AteResult:
     """Absolute trajectory error: E_i = T_reference_i^-1 A T_estimate_i with one rigid motion A for all i.
 
-    The errors are the norm of E_i's translation and the angle of its rotation.
+    Errors are E_i's translation and rotation angle.
 
     Args:
-        align: ``se3``: A minimises the squared distances of the positions, without scale (Umeyama 1991, as in the TUM
-            script). An undetermined rotation is the mean of the rotations between orientations. ``origin``: A maps the
-            first pose onto its partner, so that the error of a fixed camera is its drift. ``none``: A is the identity.
+        align: ``se3``: A minimises squared distances of positions, without scale (Umeyama 1991, as the TUM script); an
+            undetermined rotation is the mean between orientations. ``origin``: A maps the first pose onto its partner.
+            ``none``: A is the identity.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -217,10 +216,10 @@ def rpe(
 ) -> RpeResult:
     """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
 
-    Every pose i with a partner j one ``delta`` later gives one error, as in the TUM script with ``--fixed_delta``. j is
-    the pose nearest to that distance, metres along the reference path. A pair is dropped if it misses ``delta`` by more
-    than half the median time between two poses (at least ``max_difference``) for ``s``, a tenth for ``m``. The script
-    pairs across gaps of lost frames, and drops all pairs that end at the last pose.
+    Every pose i has one partner j one ``delta`` later, as in the TUM script with ``--fixed_delta``, in metres along the
+    reference path. A pair is dropped if it misses ``delta`` by half the median time step (at least ``max_difference``)
+    for ``s``, a tenth for ``m``. The script pairs across gaps of lost frames, and drops pairs that end at the last
+    pose.
     """
     times, motion_estimate, motion_reference = _motions(estimate, reference, delta, unit, max_difference)
     return RpeResult.of(times, se3.inverse(motion_reference) @ motion_estimate, delta, unit)
@@ -229,16 +228,16 @@ def rpe(
 def body_rotation(
     estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP
 ) -> tuple[Numbers, float, float]:
-    """Rotation between the reference's body and the camera, if the reference has poses of another body on the camera.
+    """Rotation between reference body and camera, for reference poses of another body:
 
-    ``r_camera = R_camera_body r_body`` for the rotation vectors of their motions in one second.
+    ``r_camera = R_camera_body r_body`` for rotation vectors in one second.
 
     Returns:
-        R_camera_body (3, 3), least squares over the rotation vectors (Kabsch 1976). Root mean square of the rotational
-        RPE per second without and with this rotation, degrees.
+        R_camera_body (3, 3), least squares (Kabsch 1976), and root mean square rotational RPE per second without and
+        with it, degrees.
 
     Raises:
-        DatasetError: The trajectories do not match in time or are shorter than a second.
+        DatasetError: No match in time, or shorter than a second.
     """
     _, motions, motions_reference = _motions(estimate, reference, 1.0, "s", max_difference)
     turns, turns_reference = se3.log_all(motions)[:, 3:], se3.log_all(motions_reference)[:, 3:]
@@ -254,7 +253,6 @@ def body_rotation(
 def _motions(
     estimate: Trajectory, reference: Trajectory, delta: float, unit: Unit, max_difference: float
 ) -> tuple[Numbers, Numbers, Numbers]:
-    """Times of the first pose (N,), and motions (N, 4, 4) of both between the pairs of ``rpe``."""
     if unit not in get_args(Unit) or not (np.isfinite(delta) and delta > 0):
         raise ConfigError(f"delta is {delta} {unit}; expected a positive number of {' or '.join(get_args(Unit))}")
     stamps, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
@@ -273,11 +271,11 @@ def _motions(
 def trajectory_figures(
     estimate: Trajectory, reference: Trajectory, align: Align = "se3", max_difference: float = LARGEST_GAP
 ) -> dict[str, float | int | str | None]:
-    """All metrics of a trajectory by name and unit, for tables and JSON.
+    """All metrics of a trajectory by name and unit.
 
-    * ``covered_share``: share of the reference's duration between consecutive pairs without a gap
-    * ATE; ``drift_rmse_m`` and ``rotation_rmse_deg``: root mean squares after aligning the first pose only
-    * RPE per second and per metre: None for the reason in ``rpe_per_s_missing`` or ``rpe_per_m_missing``
+    * ``covered_share``: share of the reference's duration without gaps
+    * ATE; ``drift_rmse_m`` and ``rotation_rmse_deg`` after aligning the first pose only
+    * RPE per second and per metre, or None with ``rpe_per_s_missing`` or ``rpe_per_m_missing``
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)
@@ -315,7 +313,7 @@ def _figures(errors: PoseErrors, trans: str, rot: str) -> dict[str, float]:
 
 
 def path_figures(estimate: Trajectory) -> dict[str, float]:
-    """Number of poses, duration and path length of a trajectory, for tables and JSON."""
+    """Number of poses, duration and path length."""
     steps = np.linalg.norm(np.diff(estimate.Ts_world_camera[:, :3, 3], axis=0), axis=1)
     duration = float(estimate.timestamps[-1] - estimate.timestamps[0])
     return {"poses": len(estimate), "duration_s": round(duration, 6), "path_length_m": round(float(steps.sum()), 6)}
@@ -327,10 +325,7 @@ RUN_FIGURES = "ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_r
 def accuracy(
     estimate: Trajectory, reference: Trajectory, keys: tuple[str, ...] = RUN_FIGURES
 ) -> dict[str, float | str | None]:
-    """Selected ``trajectory_figures``, rounded to six digits.
-
-    If the trajectories cannot be compared, the metrics are None and ``accuracy_missing`` is the reason.
-    """
+    """Selected ``trajectory_figures``, six digits; without comparison None, and ``accuracy_missing`` is the reason."""
     out: dict[str, float | str | None] = dict.fromkeys(keys)
     try:
         figures = trajectory_figures(estimate, reference)
@@ -345,10 +340,6 @@ def accuracy(
 
 
 def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
-    """Rigid motion of the estimate onto the reference from the positions, or from the orientations if necessary.
-
-    The square roots of the singular values of the cross-covariance are extents, metres. The second must not be zero.
-    """
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
     T, spread = umeyama(targets, positions)
     if spread[1] > SMALLEST_SPREAD * max(1.0, spread[0]):
@@ -360,7 +351,6 @@ def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
 
 
 def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices i, and j > i with the position nearest to position i plus delta; positions increase."""
     wanted = position + delta
     after = np.clip(np.searchsorted(position, wanted), 1, len(position) - 1)
     before = after - 1

@@ -1,4 +1,4 @@
-"""Data files of this package, and look-up of names in them."""
+"""Data files of this package."""
 
 import tomllib
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ Thing = TypeVar("Thing")
 
 @cache
 def tables(path: str) -> dict[str, Any]:
-    """Tables of a TOML file of this package, with tuples in place of its lists; do not change them."""
+    """Tables of a TOML file, with tuples for lists; do not change them."""
     return _fixed(tomllib.loads(files("dudmap.lab").joinpath(path).read_text(encoding="utf-8")))
 
 

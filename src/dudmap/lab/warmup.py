@@ -1,7 +1,7 @@
-"""Run the parts of the system that have kernels on a few small images, to compile the kernels.
+"""Run all parts with kernels on small images, to compile them.
 
-One process compiles with one thread only, so that two take half the time: a second one runs the parts in another order.
-Each loads the kernels that the other has compiled.
+Processes compile with one thread, so that a second one with another order halves the time; each loads the other's
+kernels.
 """
 
 import logging
@@ -45,13 +45,13 @@ log = logging.getLogger(__name__)
 SMALL = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SECOND_PROCESS = "labels", "several voxel sizes"
-"""Parts that a second process compiles, which take about as long as the others."""
+"""Parts of a second process, about half of the time."""
 DURING_RUN = "motion between images", "labels", "calibration", "mesh"
-"""Parts that the second process compiles while a run begins, in the order of their use."""
+"""Parts that it compiles while a run begins, by use."""
 
 
 def room(count: int) -> list[Frame]:
-    """Images of a static wall and a moving box, drawn without a kernel."""
+    """Images of a wall and a moving box, without kernels."""
     shade = np.random.default_rng(0).integers(40, 220, (15, 20, 3)).repeat(8, axis=0).repeat(8, axis=1)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     frames = []
@@ -173,9 +173,9 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
 @contextmanager
 def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
-    """Compile parts in other processes during the block, if there are a second core and a cache folder.
+    """Compile in other processes during the block, given a second core and a cache folder.
 
-    The yielded function waits for the first process.
+    The yielded function waits for the first.
     """
     environment = os.environ | {"DUDMAP_THREADS": "1"} | kernel_cache.environment()
     useful = num_threads() > 1 and kernel_cache.folder() is not None
@@ -190,10 +190,8 @@ def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[],
 
 @contextmanager
 def compiled_for_demo() -> Iterator[None]:
-    """Before the first run of a demo, compile its kernels in two other processes and wait for them.
-
-    The demo waits, because a compiler needs as much memory as the run.
-    """
+    """Compile a demo's kernels in two processes before its first run, because a compiler needs as much memory as the
+    run."""
     if not kernel_cache.is_cold() or num_threads() < 2:
         yield
         return
@@ -204,10 +202,7 @@ def compiled_for_demo() -> Iterator[None]:
 
 
 def compiled_during_run(*, live: bool = False) -> AbstractContextManager[object]:
-    """``compiled_in_background`` for the first run, which has no compiled kernels.
-
-    A later ``live`` run first loads the kernels of a calibration, which would delay its frames.
-    """
+    """``compiled_in_background`` for a first run; a later ``live`` run first loads the calibration's kernels."""
     cold = kernel_cache.is_cold()
     if live and not cold:
         dict(steps())["colour camera"]()

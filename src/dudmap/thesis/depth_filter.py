@@ -1,4 +1,4 @@
-"""Depth smoothing (thesis section 4.3): zero pixels, then the depth-adaptive bilateral filter."""
+"""Depth smoothing (thesis section 4.3): zero pixels, then the bilateral filter."""
 
 import cv2
 import numpy as np
@@ -8,16 +8,15 @@ from dudmap.core.backends.threads import bands, run_bands
 from dudmap.thesis.kernels.bilateral import filter_rows
 
 WINDOW = 5
-"""Edge of the window whose mean replaces a zero pixel, pixels (section 4.3)."""
+"""Edge of the window whose mean replaces a zero, pixels (section 4.3)."""
 ROWS = 60
-"""Rows of a band that one thread filters."""
+"""Rows that one thread filters."""
 
 
 def fill_zeros(D: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depth (H, W) with each zero pixel replaced by the mean of its 5x5 window; zero if the window is empty.
+    """Depth (H, W) with each zero replaced by the mean of its 5x5 window, if any.
 
-    Reading: the mean is over the valid pixels. Zeros are missing measurements; as depths they would draw the surface
-    towards the camera.
+    Reading: the mean is over valid pixels, because zeros are missing.
     """
     valid = (D > 0).astype(np.float32)
     total, count = (
@@ -37,7 +36,7 @@ def bilateral(D: NDArray[np.float32], alpha: float, sigma_s: float, radius: int)
     Args:
         alpha: 1/m.
         sigma_s: Pixels.
-        radius: Half width of the square window N(u_k), pixels.
+        radius: Half width of N(u_k), pixels.
     """
     out, padded = np.empty_like(D), np.pad(D, radius)
     run_bands(lambda start, stop: filter_rows(start, stop, padded, alpha, sigma_s, radius, out), bands(len(D), ROWS))

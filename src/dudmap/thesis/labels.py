@@ -11,9 +11,9 @@ from dudmap.thesis_config import ThesisConfig
 Array = NDArray[np.float64]
 
 BINS = 256
-"""Number L of bins of the histogram h(d) (eq. 4.54)."""
+"""Bins L of the histogram h(d) (eq. 4.54)."""
 NEIGHBOURHOOD = 3
-"""Edge of a pixel's neighbourhood, pixels: the union of the maximal cliques that hold it."""
+"""Edge of a neighbourhood, pixels: the union of the four maximal cliques (2x2 pixels) that hold a pixel."""
 LEAST = 1e-12
 """Smallest variance and probability, which keep logarithms finite."""
 
@@ -24,7 +24,7 @@ class Mixture:
 
     Attributes:
         P: (2,) prior probabilities of the classes.
-        rho: (2,) scales rho_c of the half-normal densities, square metres.
+        rho: (2,) scales rho_c, square metres.
         likelihood: L(D, U, l) of eq. 4.55.
     """
 
@@ -41,8 +41,8 @@ def density(d: Array, rho: float) -> Array:
 def neighbourhood_mean(u: Array, known: NDArray[np.bool_]) -> Array:
     """Mean of u (h, w) over the known pixels of each neighbourhood.
 
-    Reading: the graph of algorithm 3 connects each pixel to its eight neighbours. Its maximal cliques are squares of
-    2x2 pixels. The neighbourhood of a pixel is the union of its four cliques, 3x3 pixels.
+    Reading: algorithm 3 connects each pixel to its eight neighbours; its maximal cliques are squares of 2x2 pixels,
+    whose union is 3x3.
     """
     size = (NEIGHBOURHOOD, NEIGHBOURHOOD)
     total, count = (
@@ -57,15 +57,15 @@ def expectation_maximisation(
 ) -> tuple[Array, Mixture]:
     """Posterior u (h, w) of the dynamic class of each pixel, and the mixture (eq. 4.52-4.55, algorithm 3).
 
-    The E-step takes as prior of a pixel the mean of its neighbourhood, the M-step fits the classes to the histogram.
-    Reading: algorithm 3 iterates "while likelihood increment < threshold", which would end at once; it ends there.
+    The E-step takes the neighbourhood's mean as prior, the M-step fits the histogram. Reading: algorithm 3 iterates
+    "while likelihood increment < threshold"; it ends there.
 
     Args:
         r: (h, w) residuals (eq. 4.51).
         known: (h, w) bool, pixels with a residual.
         u: (h, w) initial labels.
-        iterations: Largest number of iterations.
-        stop: Relative increment of the likelihood that ends the EM.
+        iterations: Limit.
+        stop: Final relative increment of the likelihood.
     """
     d = r[known]
     edges = np.linspace(0, max(float(d.max()), LEAST), BINS + 1)
@@ -83,7 +83,6 @@ def expectation_maximisation(
 
 
 def _fit(centers: Array, bin_of: NDArray[np.integer], u: Array) -> Mixture:
-    """Priors and scales that maximise eq. 4.55 for the posteriors u (n,), and its value."""
     weights = np.stack([1 - u, u])
     h = np.stack([np.bincount(bin_of, weight, BINS) for weight in weights])  # h(d) u_i(d)
     total = np.maximum(h.sum(axis=1), LEAST)
@@ -94,7 +93,7 @@ def _fit(centers: Array, bin_of: NDArray[np.integer], u: Array) -> Mixture:
 
 
 def per_voxel(dynamic: NDArray[np.bool_], known: NDArray[np.bool_], X: Array, tau: float) -> NDArray[np.bool_]:
-    """Labels (h, w) of the label grid: each pixel takes the majority of the pixels in its voxel.
+    """Labels (h, w) of the label grid: the majority of each voxel's pixels.
 
     Args:
         dynamic, known: (h, w) bool.
@@ -112,10 +111,10 @@ def per_voxel(dynamic: NDArray[np.bool_], known: NDArray[np.bool_], X: Array, ta
 
 
 def dynamic_labels(psi: NDArray[np.float32], X: Array, config: ThesisConfig) -> tuple[NDArray[np.bool_], Array]:
-    """Dynamic pixels (h, w) of an image, and the posterior of the dynamic class (algorithm 3, eq. 4.50-4.57).
+    """Dynamic pixels (h, w), and the posterior of the dynamic class (algorithm 3, eq. 4.50-4.57).
 
-    The initial labels are the pixels whose difference delta_L to the static map exceeds theta. Reading: the new
-    observation has the distance 0 at its own points, so that delta_L is |psi|. Pixels off the map are static.
+    Initially, delta_L to the static map exceeds theta. Reading: the new observation has the distance 0 at its points,
+    so that delta_L is |psi|; off the map is static.
 
     Args:
         psi: (h, w) distances after the first registration, metres; NaN off the map.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from dudmap.core.geometry.camera import Camera
 
 ITERATIONS = 20
-"""Fixed-point iterations of the inverse; each divides the error by about ten for usual lenses."""
+"""Fixed-point iterations of the inverse."""
 
 
 def distort(X: NDArray[np.float64], kappa: NDArray[np.float64], rho: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -35,7 +35,7 @@ def distort(X: NDArray[np.float64], kappa: NDArray[np.float64], rho: NDArray[np.
 
 
 class Lens:
-    """Takes the distortion of a camera out of its images, and puts it back into masks.
+    """Removes a camera's distortion from images, and restores it in masks.
 
     Args:
         camera: Its coefficients are k1, k2, p1, p2[, k3[, k4, k5, k6]].
@@ -53,19 +53,18 @@ class Lens:
             self._maps = [self._pixels(camera, distort(straight, self._kappa, self._rho)), self._pixels(camera, bent)]
 
     def undistort(self, image: NDArray, *, nearest: bool) -> NDArray:
-        """Image (H, W[, 3]) without distortion: of the nearest pixel, or interpolated; 0 outside of the view."""
+        """Image (H, W[, 3]) without distortion, nearest or interpolated; 0 outside."""
         if self._maps is None:
             return image
         return np.asarray(cv2.remap(image, *self._maps[0], cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR))
 
     def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Mask (H, W) in the image as it was recorded; False outside of the view."""
+        """Mask (H, W) in the recorded image; False outside."""
         if self._maps is None:
             return mask
         return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[1], cv2.INTER_NEAREST)) > 0
 
     def _undistorted(self, bent: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Inverse of ``distort`` by fixed-point iteration."""
         X = bent
         for _ in range(ITERATIONS):
             X = X + bent - distort(X, self._kappa, self._rho)

@@ -14,20 +14,20 @@ from dudmap.thesis_config import ThesisConfig
 Array = NDArray[np.float64]
 
 FACTOR = 10.0
-"""The damping shrinks and grows by this factor with accepted and rejected steps (Marquardt 1963)."""
+"""Factor of the damping with steps (Marquardt 1963)."""
 SMALLEST_DAMPING = 1e-6
 """Damping below which it does not shrink."""
 MIN_PIXELS = 50
-"""Pixels with a distance that a pose is estimated from."""
+"""Fewest pixels with a distance for a pose."""
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Terms of the joint error (eq. 4.40) of all pixels of an image at a pose.
+    """Terms of the joint error (eq. 4.40) of all pixels.
 
     Attributes:
-        psi: (h, w) distance psi of the points to the surface, metres; NaN off the map.
-        e_c: (h, w) intensity error V_I - I, intensities in [0, 1]; NaN without intensity in the map.
+        psi: (h, w) distance to the surface, metres; NaN off the map.
+        e_c: (h, w) intensity error V_I - I in [0, 1]; NaN without intensity in the map.
     """
 
     psi: NDArray[np.float32]
@@ -35,11 +35,10 @@ class Residuals:
 
 
 def residuals(volume: TsdfVolume, level: Level, T: Array, d_max: float) -> Residuals:
-    """Distances (eq. 4.29) and intensity errors (eq. 4.31) of an image at the pose T (4, 4), camera to world.
+    """Distances (eq. 4.29) and intensity errors (eq. 4.31) at the pose T (4, 4), camera to world.
 
-    Algorithm 1 initialises every voxel to d_max. The map stores no voxels in free space, so that points there get the
-    initial distance. Reading: the initial distance of space that was never seen is unknown, since all new surfaces
-    would be dynamic otherwise.
+    Points in known free space get algorithm 1's initial distance d_max. Reading: never seen space is unknown; otherwise
+    all new surfaces would be dynamic.
     """
     volume.look_at(T)
     sample = volume.sample(level.depth, level.intensity, level.camera, T)
@@ -61,18 +60,18 @@ def gradient(volume: TsdfVolume, level: Level, T: Array) -> NDArray[np.float32]:
 def sobel(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Image gradients (h, w) along x and y, per pixel, by the Sobel-Feldman operator (eq. 4.36, 4.37).
 
-    Reading: eq. 4.37 repeats the matrix of eq. 4.36; its product is the transposed one. Both are divided by 8, the sum
-    of the smoothing weights times the baseline, to be derivatives.
+    Reading: eq. 4.37 repeats the matrix of eq. 4.36; its product is the transposed one. Both are divided by 8, to be
+    derivatives.
     """
     x, y = (cv2.Sobel(image, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=1 / 8) for dx in (1, 0))
     return np.asarray(x, np.float32), np.asarray(y, np.float32)
 
 
 def chain(gradient: Array, X: Array) -> Array:
-    """Derivative (n, 6) by the twist xi = (omega, upsilon) of a function with a gradient (n, 3) at points X (n, 3).
+    """Derivative (n, 6) by xi = (omega, upsilon) of a function with gradient (n, 3) at X (n, 3):
 
-    The product of the gradient and the Jacobian (-hat(X), I) of a point is (X x gradient, gradient) (eq. 4.34, 4.35).
-    Reading: the matrix of eq. 4.35 holds the coordinates of the point, not of the twist.
+    (X x gradient, gradient) (eq. 4.34, 4.35). Reading: the matrix of eq. 4.35 holds the coordinates of the point, not
+    of the twist.
     """
     (x, y, z), (a, b, c) = X.T, gradient.T
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c], axis=1)
@@ -92,7 +91,7 @@ def exponential(xi: Array) -> Array:
 
 
 class Registration:
-    """Estimates the pose that minimises the joint error of an image and the map (algorithm 2)."""
+    """Pose that minimises the joint error of image and map (algorithm 2)."""
 
     def __init__(self, config: ThesisConfig) -> None:
         self.config = config
@@ -100,22 +99,19 @@ class Registration:
     def align(
         self, volume: TsdfVolume, levels: list[Level], T: Array, labels: NDArray[np.bool_] | None = None
     ) -> tuple[Array, Residuals]:
-        """Pose (4, 4) that minimises the error, coarse to fine, and the residuals of the finest level there.
+        """Pose (4, 4), coarse to fine, and the finest residuals there.
 
         Args:
             T: Initial pose (4, 4), camera to world.
-            labels: (h, w) bool, dynamic pixels of the finest level, which do not count. None for none.
+            labels: (h, w) bool, dynamic pixels of the finest level, not counted; None for none.
         """
         for level in levels[::-1]:
             T = self._align_level(volume, level, T, None if labels is None else _resized(labels, level))
         return T, residuals(volume, levels[0], T, self.config.d_max)
 
     def _align_level(self, volume: TsdfVolume, level: Level, T: Array, labels: NDArray[np.bool_] | None) -> Array:
-        """Pose after the iterations of one level.
-
-        Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end. As in
-        the text after it, both conditions must hold. A step that does not reduce the error is rejected.
-        """
+        """Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end. As
+        in the text after it, both conditions must hold. A step that does not reduce the error is rejected."""
         found = residuals(volume, level, T, self.config.d_max)
         damping, error = self.config.lambda_0, self.error(found, labels)
         H, g = self.normal_equations(volume, level, T, found, labels)
@@ -139,15 +135,15 @@ class Registration:
     def step(self, H: Array, g: Array, damping: float) -> Array:
         """Increment delta (6,) of the damped normal equations, eq. 4.41 or 4.42.
 
-        Reading: eq. 4.42 lacks the minus sign of eq. 4.41. Its damping lambda J^T J only shortens the Gauss-Newton
-        step, by 1 / (1 + lambda).
+        Reading: eq. 4.42 lacks the minus sign of eq. 4.41. Its damping lambda J^T J shortens the step by 1 / (1 +
+        lambda).
         """
         A = H + damping * (np.eye(6) if self.config.damping == "identity" else H)
         return np.asarray(np.linalg.lstsq(A, -g, rcond=None)[0], np.float64)
 
     def error(self, found: Residuals, labels: NDArray[np.bool_] | None) -> float:
-        """Joint error (eq. 4.40) with the weights of eq. 4.46, per pixel: the pixels with a distance change with the
-        pose. Infinity for fewer than ``MIN_PIXELS``."""
+        """Joint error (eq. 4.40, weights of 4.46) per pixel, because the pixels change with the pose. Infinity below
+        ``MIN_PIXELS``."""
         used = _used(found, labels)
         psi, e_c = found.psi[used].astype(np.float64), np.nan_to_num(found.e_c[used].astype(np.float64))
         if len(psi) < MIN_PIXELS:
@@ -161,8 +157,8 @@ class Registration:
         """J^T J (6, 6) and J^T f (6,) of both terms (eq. 4.43, 4.46, 4.47) from the residuals ``found`` at T.
 
         Readings: eq. 4.46 and 4.47 have rho(psi) before the sums; it weighs each pixel. Eq. 4.38 differentiates a sum
-        of squares; J_c is the derivative of V_I - I. The gradient of V_I is replaced by the image gradient, which
-        equals it after registration (eq. 4.36, 4.37 differentiate images).
+        of squares; J_c is the derivative of V_I - I, by the image gradient, equal after registration (eq. 4.36, 4.37
+        differentiate images).
         """
         eta = gradient(volume, level, T)
         used = _used(found, labels) & np.isfinite(eta).all(axis=-1)
@@ -183,8 +179,6 @@ class Registration:
 
     @staticmethod
     def _color_gradient(level: Level, p: Array, used: NDArray[np.bool_]) -> Array:
-        """Gradient of the intensity by the point (n, 3), camera axes: image gradient times Jacobian of the
-        projection."""
         I_x, I_y = (image[used].astype(np.float64) for image in sobel(level.intensity))
         (fx, fy), Z = level.camera.focal, p[:, 2]
         return np.stack([I_x * fx / Z, I_y * fy / Z, -(I_x * fx * p[:, 0] + I_y * fy * p[:, 1]) / Z**2], axis=-1)

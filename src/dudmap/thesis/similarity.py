@@ -5,16 +5,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 TREES, CHECKS = 5, 50
-"""KD-trees and leaves visited per search of FLANN (Muja and Lowe 2009), the values of OpenCV's examples."""
+"""KD-trees and visited leaves of FLANN (Muja and Lowe 2009), OpenCV's examples."""
 KD_TREE = 1
-"""Number of FLANN's index of KD-trees."""
+"""FLANN's number of KD-trees."""
 
 
 class Similarity:
     """Compares each image with the one before.
 
-    Reading: the thesis compares "the consecutive images", so that the reference is the image before, whether that was
-    skipped or not. The ratio is the number of good matches over the smaller number of features of the two images.
+    Reading: "the consecutive images" means the image before, skipped or not. The ratio is good matches over the smaller
+    number of features.
 
     Args:
         lowe_ratio: Nearest over second nearest distance of a good match.
@@ -27,7 +27,7 @@ class Similarity:
         self._before: NDArray[np.float32] | None = None
 
     def ratio(self, intensity: NDArray[np.float32]) -> float:
-        """Similarity ratio in [0, 1] of an image (H, W), intensities in [0, 1], to the image before; 0 without one."""
+        """Similarity in [0, 1] of an image (H, W), [0, 1], to the image before; 0 without."""
         cv2.setRNGSeed(0)  # FLANN builds random trees
         _, features = self._sift.detectAndCompute((255 * intensity).astype(np.uint8), None)
         before, self._before = self._before, features

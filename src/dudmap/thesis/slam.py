@@ -42,14 +42,14 @@ def volume_config(config: ThesisConfig) -> VolumeConfig:
 
 
 class ThesisSlam:
-    """Dense SLAM as chapter 4 of the thesis describes it. A failed registration is neither detected nor recovered.
+    """Dense SLAM of chapter 4 of the thesis; failed registrations are neither detected nor recovered.
 
     Args:
-        calibration: Of the colour camera; None for colour that is registered to depth, which the thesis assumes.
+        calibration: Of the colour camera; None for registered colour, as in the thesis.
 
     Attributes:
-        volume: The map; ``extract_mesh`` and ``raycast`` give the mesh and the artificial view.
-        color_error: (h, w) float32 error e_c of the last registered frame (eq. 4.49); NaN without colour in the map.
+        volume: The map.
+        color_error: (h, w) float32 e_c of the last registered frame (eq. 4.49); NaN without colour in the map.
     """
 
     first_pass, localize, device, calibration_waits = None, False, "cpu", 0
@@ -88,7 +88,7 @@ class ThesisSlam:
         Reading: a redundant frame is neither registered nor fused, and keeps the pose of its predecessor.
 
         Args:
-            frame: Depth and colour, in the order of arrival; ``prepare`` may have been called before.
+            frame: In order of arrival; ``prepare`` may have been called.
 
         Raises:
             FrameError: The images do not have the camera's size.
@@ -159,7 +159,6 @@ class ThesisSlam:
         *,
         similar: Verdict = ACCEPTED,
     ) -> FrameResult:
-        """Result of a frame; the mask has the geometry of the recorded image."""
         self._poses.append((image.timestamp, T))
         mask = full_size(dynamic, level.depth, image.depth)
         return FrameResult(

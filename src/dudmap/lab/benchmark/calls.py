@@ -1,4 +1,4 @@
-"""Cost of a frame besides arithmetic: launches, barriers, Python calls, files, time around kernels, and bytes."""
+"""Cost of a frame: launches, barriers, Python calls, files, time around kernels, bytes."""
 
 import gc
 import sys
@@ -27,26 +27,23 @@ if TYPE_CHECKING:
 
 CORE = str(Path(slam_module.__file__).parent)
 COUNTED_FROM = 40
-"""Frames before the counted ones: a map of the first second knows little."""
+"""Frames before the counted ones."""
 BYTES_PER_PIXEL = 12 + 8 * 4 + 8
-"""Bytes per pixel of one linearisation: depth, intensity, weight; eight voxels; two residuals."""
+"""Bytes per pixel of a linearisation: depth, intensity, weight; eight voxels; two residuals."""
 BYTES_PER_VOXEL, BYTES_PER_READING = 2 * 8, 13
-"""Bytes of a fusion, per voxel read and written (distance, weight, intensity, colour), and per pixel (depth, colour,
-mask, packed pixel)."""
+"""Bytes of a fusion, per voxel read and written, and per pixel."""
 COPIED = 1 << 24
-"""Four-byte numbers copied to measure the memory bandwidth: more than caches hold."""
+"""Four-byte numbers copied to measure bandwidth, beyond caches."""
 
 
 class FrameCost(NamedTuple):
     """Costs of two consecutive frames.
 
     Attributes:
-        counts: Of the first frame, in the thread that calls ``Slam.process``. ``launches``: calls of compiled kernels.
-            ``barriers``: calls that wait for other threads. ``calls``: calls of Python and C functions outside of
-            kernels. ``files``: files of ``core`` that the frame enters.
-        inside: By stage, of the first frame: ``kernel_us``, microseconds in kernels; ``launches``; ``barriers``;
-            ``bytes`` that registration and fusion read and write.
-        stages: Milliseconds by stage, of the second frame, which is not slowed down by the counting.
+        counts: Of the first frame, in its thread: kernel ``launches``; ``barriers`` that wait for threads; ``calls`` of
+            Python and C outside kernels; ``files`` of ``core``.
+        inside: By stage, first frame: ``kernel_us``, ``launches``, ``barriers``, ``bytes`` of registration and fusion.
+        stages: Milliseconds by stage, second frame, not slowed down by counting.
     """
 
     counts: dict[str, int]
@@ -55,7 +52,7 @@ class FrameCost(NamedTuple):
 
 
 def count_calls(sequence: "Sequence", config: Config, frames: int) -> list[FrameCost]:
-    """Costs of the frames after the first ``COUNTED_FROM``, without self-calibration, which runs in the background."""
+    """Costs of the frames after ``COUNTED_FROM``, without self-calibration."""
     config = config.override(["sensor.self_calibration=false"])
     slam = Slam(sequence.camera, config, calibration=sequence.calibration)
     costs, counted = [], None
@@ -72,15 +69,12 @@ def count_calls(sequence: "Sequence", config: Config, frames: int) -> list[Frame
 
 
 def summary(costs: list[FrameCost]) -> dict[str, float]:
-    """Median of each count over the frames."""
+    """Median of each count."""
     return {name: float(median(one.counts[name] for one in costs)) for name in (costs[0].counts if costs else ())}
 
 
 def stage_table(costs: list[FrameCost], rate: float) -> str:
-    """Markdown table of each stage's medians: time in kernels and around them, launches, barriers, bytes.
-
-    The last column is the memory time of these bytes at ``rate`` bytes per second.
-    """
+    """Markdown table of each stage's medians; last column: memory time at ``rate`` bytes per second."""
     rows = []
     for name in dict.fromkeys(name for one in costs for name in one.stages):
         whole = median(one.stages.get(name, 0.0) for one in costs)
@@ -96,7 +90,7 @@ def stage_table(costs: list[FrameCost], rate: float) -> str:
 
 
 def memory_rate() -> float:
-    """Bytes per second that all threads together read and write in a copy, the best of five."""
+    """Bytes per second of a copy by all threads, best of five."""
     source, target, seconds = np.ones(COPIED, np.float32), np.empty(COPIED, np.float32), []
     parts = threads.bands(COPIED, -(-COPIED // threads.num_threads()))
     for _ in range(5):
@@ -130,7 +124,6 @@ def _weighed(slam: Slam, view: FrameView, inside: dict[str, Counter[str]]) -> It
 
 
 def _counted(slam: Slam, view: FrameView) -> tuple[dict[str, int], dict[str, Counter[str]]]:
-    """Counts of a frame, in all and by stage."""
     # isinstance would access dead proxies
     compiled = [found for found in gc.get_objects() if issubclass(type(found), Dispatcher)]
     # kernels inline formulas, and Python calls them uncompiled

@@ -1,4 +1,4 @@
-"""``dudmap benchmark compile``: the compiled kernels, the time that each takes to compile, and its callers."""
+"""``dudmap benchmark compile``: compiled kernels, seconds, callers."""
 
 import sys
 import tempfile
@@ -15,7 +15,7 @@ from dudmap.lab.benchmark.measure import grid
 
 
 class _Times(event.Listener):
-    """Time of each kernel. A function that several kernels inline counts in the first of them."""
+    """Time of each kernel."""
 
     def __init__(self) -> None:
         self.rows: dict[str, dict[str, Any]] = {}
@@ -38,7 +38,6 @@ class _Times(event.Listener):
 
 
 def _caller() -> str:
-    """Nearest function of dudmap on the stack outside of cache, decorators and threads."""
     own = {__name__, "dudmap.core.backends.cpu.teams", "dudmap.core.backends.threads", "dudmap.core.kernel_cache"}
     frame = sys._getframe()
     while frame.f_back is not None:
@@ -50,11 +49,11 @@ def _caller() -> str:
 
 
 def compile_all(steps: list[tuple[str, Callable[[], object]]]) -> dict[str, Any]:
-    """Compile the kernels of all parts of the system into an empty folder; runs in a separate process.
+    """Compile all kernels into an empty folder, in a separate process.
 
     Returns:
-        ``rows`` by kernel, the longest first: ``seconds`` of its thread, number of argument ``types``, the first
-        ``part`` that needs it, and ``callers``.
+        ``rows`` by kernel, longest first: ``seconds``, number of argument ``types``, first ``part`` that needs it,
+        ``callers``.
     """
     times, settings = _Times(), cast(Any, config)
     event.register("numba:compile", times)
@@ -75,7 +74,7 @@ def compile_warmup(_: None = None) -> dict[str, Any]:
 
 
 def table(tree: dict[str, Any]) -> str:
-    """Markdown table of the kernels, with the sum in its last line."""
+    """Markdown table of the kernels, with the sum."""
     rows = tree["rows"]
     lines = [
         [name, row["part"], ", ".join(row["callers"]), str(row["types"]), f"{row['seconds']:.2f}"]

@@ -1,10 +1,9 @@
-"""Score trajectories without ground truth, by how well they explain the images of a recording.
+"""Score trajectories without ground truth by how well they explain a recording's images.
 
-A frame rendered from the pose of another frame must show the depth and intensities measured there. All trajectories are
-compared on the same pixels of the same pairs of frames, so that noise, movers and occlusion affect them alike. Points
-are projected with the pose, the velocity and the row times; every trajectory has a calibration of the cameras.
+A frame rendered from another's pose must show its depth and intensities; all trajectories are compared on the same
+pixels. Points are projected with pose, velocity, row times and each trajectory's calibration.
 
-Trajectories with too few common frames raise a ``DatasetError``.
+Too few common frames raise a ``DatasetError``.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,36 +33,34 @@ from dudmap.io.sequences import Sequence
 GAPS = 5, 15, 30
 """Frames between the two of a pair."""
 PAIRS = 100
-"""Approximate number of compared pairs per gap."""
+"""Compared pairs per gap, about."""
 TERMS = {"depth": "mm at 1 m", "intensity": "of 255"}
 """Compared quantities and their units."""
 WORST_DEPTH, WORST_INTENSITY = 0.05, 0.2
-"""Largest counted differences: of depth over the squared depth (1/m), and of intensity (0..1). A pixel beyond for
-every trajectory is excluded as occluded or dynamic."""
+"""Largest counted differences of depth over squared depth (1/m), and of intensity (0..1); pixels beyond for all are
+excluded."""
 SMOOTH = 0.05
-"""Largest relative step of the depth to a neighbour at which a surface is interpolated."""
+"""Largest relative depth step of an interpolated surface."""
 TEXTURED = 0.02
-"""Smallest gradient of the intensity (0..1) per pixel."""
+"""Smallest intensity gradient (0..1) per pixel."""
 BLUR = 1.0
-"""Standard deviation of the Gaussian that smooths the intensities, pixels; else interpolation would reduce noise of
-calibrated colours only."""
+"""Smoothing of intensities, pixels; else interpolation reduces noise of calibrated colours only."""
 ROW_STEPS = 3
-"""Iterations for the row at which a point was recorded; each reduces the error at least to a tenth."""
 FEWEST = 200
-"""Fewest common pixels of a pair; with fewer, the pair or its intensities are excluded."""
+"""Fewest common pixels of a pair, or of its intensities."""
 ROUNDING = 1e-4
-"""Relative difference of misfits that rounding explains."""
+"""Relative misfit difference of rounding."""
 SAMPLES, LEAST_BLOCKS = 2000, 3
-"""Samples of the bootstrap, and fewest stretches of the recording that it needs."""
+"""Bootstrap samples, and fewest stretches."""
 
 
 class Consistency(NamedTuple):
     """Misfits of k trajectories.
 
     Attributes:
-        misfits: (2, gaps, blocks, k) sums of the misfits of depth (mm at 1 m) and intensity (of 255). A block is the
-            pairs that begin in one stretch of the recording, as long as the longest gap.
-        counts: (2, gaps, blocks) numbers of pairs.
+        misfits: (2, gaps, blocks, k) sums of depth (mm at 1 m) and intensity (of 255); a block is a stretch as long as
+            the longest gap.
+        counts: (2, gaps, blocks) pairs.
     """
 
     names: list[str]
@@ -76,25 +73,19 @@ class Consistency(NamedTuple):
         return self.misfits.sum(axis=2) / np.maximum(self.counts.sum(axis=2), 1)[..., None]
 
     def samples(self) -> NDArray[np.float64]:
-        """Bootstrap samples (SAMPLES, 2, gaps, k) of the mean misfits.
-
-        Stretches are drawn with replacement, because overlapping pairs are dependent and stretches hardly are.
-        """
+        """Bootstrap samples (SAMPLES, 2, gaps, k) of the means, drawn by independent stretches."""
         blocks = self.misfits.shape[2]
         times = np.random.default_rng(0).multinomial(blocks, np.full(blocks, 1 / blocks), SAMPLES)
         sums = np.einsum("sb,tgbk->stgk", times, self.misfits)
         return sums / np.maximum(np.einsum("sb,tgb->stg", times, self.counts), 1)[..., None]
 
     def intervals(self) -> NDArray[np.float64]:
-        """Ends (2, 2, gaps, k) of the 95 % intervals of the means."""
+        """95 % intervals (2, 2, gaps, k) of the means."""
         return np.percentile(self.samples(), (2.5, 97.5), axis=0)
 
     def excess(self, term: int, one: int, other: int) -> tuple[float, float, float]:
-        """Relative excess of one trajectory's misfit over another's, mean over the gaps, and the ends of its 95 %
-        interval.
-
-        NaN if no pair could be compared.
-        """
+        """Relative excess of one trajectory's misfit over another's, mean over gaps, and its 95 % interval; NaN without
+        pairs."""
         seen = self.counts[term].any(axis=1)
         if not seen.any():
             return np.nan, np.nan, np.nan
@@ -103,7 +94,7 @@ class Consistency(NamedTuple):
         return (float(share), *np.percentile(drawn, (2.5, 97.5)).tolist())
 
     def verdicts(self) -> list[str]:
-        """One sentence per term on every trajectory that is not the best one."""
+        """A sentence per term on every trajectory but the best."""
         sentences = []
         for term, name in enumerate(TERMS):
             best = int(np.argmin(np.log(np.maximum(self.means()[term], 1e-9)).sum(axis=0)))
@@ -115,7 +106,7 @@ class Consistency(NamedTuple):
         return sentences
 
     def table(self) -> str:
-        """Markdown table of the misfits with half the width of their 95 % intervals, and the verdicts."""
+        """Markdown table of misfits with half their 95 % intervals, and verdicts."""
         low, high = self.intervals()
         head = ["", *(f"{term} ({unit}), {gap}" for term, unit in TERMS.items() for gap in self.gaps)]
         cells = np.stack([self.means(), (high - low) / 2], axis=-1).reshape(-1, len(self.names), 2)
@@ -129,9 +120,9 @@ class Images(NamedTuple):
 
     Attributes:
         camera: Of the depth.
-        depth: (h, w) float32, metres, 0 = missing or known to be dynamic.
-        intensity: (hc, wc) float32, 0..1, of the colour image.
-        color_offset: Time stamp of the colour image minus the depth image's, seconds.
+        depth: (h, w) float32, metres, 0 = missing or dynamic.
+        intensity: (hc, wc) float32, 0..1, colour image.
+        color_offset: Time stamp of colour minus depth, seconds.
     """
 
     camera: Camera
@@ -144,8 +135,8 @@ class Motion(NamedTuple):
     """Relation of two frames by a trajectory and its calibration.
 
     Attributes:
-        T_second_first: (4, 4) of the depth cameras at the times of the middle rows.
-        velocities: (6,) twists per second of both frames, camera axes.
+        T_second_first: (4, 4), depth cameras at the middle rows.
+        velocities: (6,) twists per second, camera axes.
     """
 
     T_second_first: NDArray[np.float64]
@@ -160,11 +151,9 @@ def measure_consistency(
     max_frames: int | None = None,
     calibrations: Mapping[str, Calibration] | None = None,
 ) -> Consistency:
-    """Compare pairs of frames of a recording under several trajectories.
+    """Compare pairs of frames under several trajectories, without known dynamic pixels.
 
-    Known dynamic pixels, and gaps too long for the recording, are excluded. Trajectories without an entry in
-    ``calibrations`` use the recording's calibration. Poses are at the stamps of the depth images, which are
-    ``depth_late``.
+    ``calibrations`` default to the recording's. Poses are at the depth stamps, ``depth_late``.
     """
     stamps, given = sequence.timestamps[:max_frames], sequence.calibration or Calibration.registered(sequence.camera)
     cameras = [(calibrations or {}).get(name, given) for name in trajectories]
@@ -217,9 +206,9 @@ def measure_consistency(
 
 
 def pair_misfits(first: Images, second: Images, motions: List[Motion]) -> NDArray[np.float64]:
-    """Mean misfits (2, k) of depth (mm at 1 m) and intensity (of 255) of two frames on the same pixels, for k motions.
+    """Mean misfits (2, k) of depth (mm at 1 m) and intensity (of 255) of two frames, for k motions;
 
-    NaN if the images have too little in common.
+    NaN with too little in common.
     """
     import cv2
 
@@ -275,8 +264,7 @@ def _moving(
 def _seen(
     points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64], offset: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Pixels (n, 2) at which a second camera recorded points (3, n), and their depths (n,); see ``Calibration``.
-    ``offset``: difference of the stamps."""
+    """Pixels at which a second camera recorded points, and their depths; see ``Calibration``."""
     camera, at = calibration.camera, _moving(points, velocity)
     readout, delay = calibration.depth_readout + calibration.readout, np.float32(offset + calibration.delay)
     seen = _moved(calibration.T_color_depth, at(np.full(points.shape[1], -delay)))
@@ -313,7 +301,6 @@ def _smoothed(intensity: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _velocity(poses: Mapping[int, NDArray[np.float64]], stamps: NDArray[np.float64], n: int) -> NDArray[np.float64]:
-    """Twist (6,) per second of frame ``n`` from neighbouring poses; 0 if none is near."""
     first, last = (m if m in poses and abs(stamps[m] - stamps[n]) <= MAX_GAP / 2 else n for m in (n - 1, n + 1))
     return central_velocity((stamps[first], poses[first]), (stamps[last], poses[last]))
 

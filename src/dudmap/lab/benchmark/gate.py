@@ -1,7 +1,4 @@
-"""Accuracy gate: on a small fixed set of recordings no metric may be worse than the recorded one plus a margin.
-
-A missing file or metric raises a ``ConfigError``.
-"""
+"""Accuracy gate: no metric may be worse than recorded plus a margin. Missing ones raise a ``ConfigError``."""
 
 import tomllib
 from collections.abc import Mapping
@@ -17,7 +14,7 @@ from dudmap.lab.benchmark.measure import Row, measure_sequence
 from dudmap.lab.benchmark.suites import WORLDS, Entry
 
 EXCERPT = "freiburg1_xyz"
-"""Twelve real frames among the test fixtures."""
+"""Twelve real frames of the test fixtures."""
 FIGURES: dict[str, tuple[str, float, float]] = {
     "lost": ("<=", 0.0, 0.0),
     "ate_rmse_m": ("<=", 0.15, 0.001),
@@ -27,7 +24,7 @@ FIGURES: dict[str, tuple[str, float, float]] = {
     "mesh_completeness": (">=", 0.0, 0.01),
     "ghost_area_m2": ("<=", 0.20, 0.02),
 }
-"""Recorded metrics: whether smaller or larger is better, and the margins of a new file, relative and absolute."""
+"""Recorded metrics: better direction, default margins, relative and absolute."""
 HEAD = """\
 # Recorded figures of the accuracy gate; written by `dudmap benchmark gate --update`, reviewed by a person.
 # A figure may become worse by relative * recorded + absolute.
@@ -36,13 +33,13 @@ HEAD = """\
 
 
 def gate_entries(fixtures: Path) -> list[Entry]:
-    """Recordings of the gate; the folder of the fixtures contains the real excerpt."""
+    """Recordings of the gate, with the real excerpt of the fixtures."""
     worlds = [Entry(name, parameters=parameters) for name, parameters in WORLDS["gate"].items()]
     return [*worlds, Entry(EXCERPT, fixtures / EXCERPT)]
 
 
 def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
-    """Metrics of every recording, measured in this process."""
+    """Metrics of every recording."""
     rows = []
     for entry in entries:
         sequence = entry.open()
@@ -52,10 +49,10 @@ def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
 
 
 def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
-    """Compare every recorded metric of the measured recordings with its measured value.
+    """Compare recorded with measured metrics.
 
     Returns:
-        ``sequence``, ``figure``, ``recorded``, ``bound`` (worst value that passes), ``measured`` and ``passed``.
+        ``sequence``, ``figure``, ``recorded``, ``bound`` (worst passing), ``measured``, ``passed``.
     """
     checks = []
     for row in rows:
@@ -75,7 +72,7 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
 
 
 def load_figures(path: Path) -> dict[str, Any]:
-    """Content of the file: ``margins`` by metric, and ``figures`` by recording and metric."""
+    """``margins`` by metric, and ``figures`` by recording and metric."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:
@@ -86,7 +83,7 @@ def load_figures(path: Path) -> dict[str, Any]:
 
 
 def save_figures(path: Path, rows: list[Row], margins: Mapping[str, Any] | None = None) -> None:
-    """Write the measured metrics as the recorded ones; given margins replace the default ones."""
+    """Write measured as recorded metrics; given margins replace the defaults."""
     default = {figure: {"relative": relative, "absolute": part} for figure, (_, relative, part) in FIGURES.items()}
     figures = {
         row["sequence"]: {key: round(row[key], 6) for key in FIGURES if row.get(key) is not None} for row in rows
@@ -96,7 +93,7 @@ def save_figures(path: Path, rows: list[Row], margins: Mapping[str, Any] | None 
 
 
 def verdict(checks: list[Row]) -> str:
-    """The checks as a Markdown table."""
+    """Markdown table of the checks."""
     rows = []
     for check in checks:
         allowed, measured = f"{FIGURES[check['figure']][0]} {check['bound']:.5g}", check["measured"]

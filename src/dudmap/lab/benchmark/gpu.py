@@ -1,4 +1,4 @@
-"""Time per frame and per kernel on a GPU, and on the CPU for comparison."""
+"""Time per frame and kernel on a GPU and the CPU."""
 
 import statistics
 import time
@@ -14,7 +14,7 @@ from dudmap.lab.benchmark.measure import Row
 from dudmap.lab.benchmark.speed import WARM_UP, median_seconds
 
 KERNELS_EVERY = 4
-"""Every fourth frame measures kernels, the others stages: events around kernels take time."""
+"""Frames that measure kernels, whose events take time."""
 
 
 def measure_devices(
@@ -24,9 +24,9 @@ def measure_devices(
     wanted: str,
     announce: Callable[[str], None],
 ) -> list[Row]:
-    """Rows of recordings by name with each voxel size (m), on the GPU, if there is one, and on the CPU.
+    """Rows of recordings by name at each voxel size (m), on GPU, if any, and CPU.
 
-    ``announce`` is called with a description of the next measurement.
+    ``announce`` receives the next measurement.
     """
     device, rows = resolve(wanted), list[Row]()
     for name, recording in recordings.items():
@@ -38,12 +38,11 @@ def measure_devices(
 
 
 def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> Row:
-    """Process the first ``frames`` frames with voxels of a size (m).
+    """Process ``frames`` frames with a voxel size (m).
 
     Returns:
-        Medians in milliseconds: of a frame, of its ``stages``, of ``kernels`` on a GPU, of a mesh, and of a view of the
-            camera's size. Also the number of triangles, and MB of the map and of the peak GPU memory. Only ``error`` if
-            the device fails.
+        Medians in milliseconds of a frame, its ``stages``, ``kernels``, a mesh, a view; triangles, MB of map and peak
+        GPU memory. Only ``error`` if the device fails.
     """
     row: Row = {"what": name, "voxel": voxel, "device": device}
     try:
@@ -98,7 +97,7 @@ def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
 
 
 def table(rows: list[Row]) -> str:
-    """Markdown: times and memory of each run, then the kernels of runs on a GPU."""
+    """Markdown: times and memory of each run, then kernels."""
     stages, body = list(dict.fromkeys(stage for row in rows for stage in row.get("stages", ()))), []
     for row in rows:
         figures = {**row.get("stages", {}), **row}

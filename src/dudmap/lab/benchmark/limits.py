@@ -1,7 +1,7 @@
-"""The limit of dynamics: the largest dynamic share of the image with which tracking still succeeds.
+"""The largest dynamic share of the image at which tracking succeeds.
 
-The share of people in the image grows, for several speeds, for several camera paths, and with people from the start
-(``limits`` in ``suites.toml``). ``docs/limits.md`` defines the metrics.
+Shares of people grow at several speeds, camera paths, and from the start (``suites.toml``). ``docs/limits.md`` defines
+the metrics.
 """
 
 from collections.abc import Collection
@@ -11,10 +11,10 @@ from dudmap.evaluation.tables import Row, grid
 from dudmap.lab.data import tables
 
 LARGEST_ATE = 0.02
-"""A system copes with a world if no frame is lost and the ATE RMSE is at most this, metres."""
+"""Largest ATE RMSE of a coped world, metres, without a lost frame."""
 DATA = tables("benchmark/suites.toml")["limits"]
 SWEEPS: dict[str, dict[str, Any]] = DATA["sweeps"]
-"""Values of one parameter of the worlds, and the shares of the image that people cover with each."""
+"""Values of one parameter, and the shares of people with each."""
 
 
 def worlds() -> dict[str, dict[str, Any]]:
@@ -28,12 +28,12 @@ def worlds() -> dict[str, dict[str, Any]]:
 
 
 def name_of(sweep: dict[str, Any], value: object, share: float) -> str:
-    """Name of the world of a value and a share."""
+    """Name of a value's and share's world."""
     return f"{sweep['parameter']}-{value}-{100 * share:.0f}"
 
 
 def limits_table(rows: Collection[Row], systems: Collection[str]) -> str:
-    """Markdown table of the largest share up to which each system copes with all shares, per value of every sweep."""
+    """Markdown table of the largest coped share per value of every sweep."""
     found = {(row["sequence"], row["system"]): row for row in rows}
     text = "\nLargest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"
     for sweep in SWEEPS.values():

@@ -1,7 +1,4 @@
-"""Measure a system on a recording, in a separate process so that nothing is shared; tables of the results.
-
-An unusable recording, or one without a tracked frame, raises a ``DudmapError``.
-"""
+"""Measure a system on a recording in a separate process; tables. Unusable recordings raise a ``DudmapError``."""
 
 import csv
 import hashlib
@@ -33,24 +30,21 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 SCORED = (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg")
-"""Metrics of a trajectory; the drift is measured after aligning the first pose only."""
+"""Metrics of a trajectory; drift after aligning the first pose only."""
 COMPLETE_WITHIN = 0.02
-"""Largest distance to the mesh of a reconstructed point of the true surface, metres."""
+"""Distance of reconstructed true surface from the mesh, metres."""
 SAMPLES = 100_000
-"""Points sampled on each surface; shares vary by 0.03 %, a third of the gate's smallest margin."""
+"""Points on each surface; shares vary by 0.03 %."""
 FEWER_SAMPLES = 40_000
-"""The same for comparisons of many runs: 0.05 %."""
+"""The same for many runs: 0.05 %."""
 
 
 DIED: Row = {"error": "its process died without a result, as when it crashes or runs out of memory"}
 
 
 class Job(NamedTuple):
-    """One measurement of a suite: recording, name and parameters of the system, and the folder that keeps the run.
-
-    Without a folder the mesh is not scored. ``calibrate`` is whether the colour camera is calibrated first, as in
-    ``dudmap run``.
-    """
+    """One measurement: recording, system, parameters, run folder (None: no mesh score), and ``calibrate`` the colour
+    camera first."""
 
     entry: Entry
     system: str
@@ -85,10 +79,10 @@ def measure_sequence(
     """Run a system on a recording: metrics of its metrics.json and errors of trajectory and mesh.
 
     Args:
-        surfaces: True static surface and its observed part, in the frame of the ground truth, if known.
-        out: Folder that keeps the run; None keeps nothing.
-        passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless frames are rendered.
-        calibrate: Estimate the calibration of the colour camera first; else use the recording's.
+        surfaces: True static surface and observed part, ground truth frame, if known.
+        out: Run folder; None keeps nothing.
+        passes, ahead: See ``dudmap.app.pipeline.run.run``; None reads ahead unless rendered.
+        calibrate: Estimate the colour calibration first.
     """
     from dudmap.app.pipeline.frame_source import AHEAD
     from dudmap.app.pipeline.run import run
@@ -125,13 +119,12 @@ def score_mesh(
     seen: "Mesh | Surface",
     samples: int = SAMPLES,
 ) -> Row:
-    """Accuracy, completeness and ghosts of a mesh in the world frame of the estimated trajectory.
-
-    The mesh is aligned by the first pose only, so that a bent or shifted map is penalised.
+    """Accuracy, completeness and ghosts of a mesh, aligned by the first pose only, so that bent or shifted maps are
+    penalised.
 
     Args:
-        whole: True static surface in the world frame of ``truth``, for accuracy and ghosts.
-        seen: Part of it that the camera saw, for completeness.
+        whole: True static surface, world frame of ``truth``.
+        seen: Its observed part, for completeness.
     """
     from dudmap.evaluation.reconstruction import compare_surfaces
     from dudmap.evaluation.surface import moved
@@ -147,7 +140,7 @@ def score_mesh(
 
 
 def score_parts(run: Path, truth: Trajectory, parts: Mapping[str, "Mesh"]) -> Row:
-    """Share of each visible part of the true surface within ``COMPLETE_WITHIN`` of a run's mesh, aligned as above."""
+    """Share of each visible true part within ``COMPLETE_WITHIN`` of a run's mesh."""
     from dudmap.core.geometry.mesh import Mesh
     from dudmap.evaluation.surface import Surface, moved
 
@@ -171,11 +164,11 @@ def measure_each(
     *,
     shared: bool = False,
 ) -> list[Row]:
-    """Rows ``label | function(argument)`` of labelled arguments, in their order, each from a separate process.
+    """Rows ``label | function(argument)`` in order, from separate processes.
 
     Args:
-        workers: Number of processes at a time. Times per frame are reliable with one only.
-        shared: Reuse the processes for several jobs. If one dies, the remaining jobs have separate processes.
+        workers: Processes; times are reliable with one.
+        shared: Reuse processes; if one dies, the rest have separate ones.
     """
     jobs = list(jobs)
     rows: dict[str, Row] = {}
@@ -217,7 +210,7 @@ def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] =
 
 
 def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
-    """Result of ``function(argument)`` in a new process; ``{"error": sentence}`` if it raises or the process dies."""
+    """Result of ``function(argument)`` in a new process; ``{"error": sentence}`` if it fails."""
     with _processes(1) as pool:
         return _result(pool, function, argument)
 
@@ -240,7 +233,6 @@ def _processes(count: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this process with its parent; it would wait for its next job forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
@@ -248,7 +240,7 @@ def _end_with_parent() -> None:
 
 @cache
 def code_hash(without: tuple[str, ...] = ()) -> str:
-    """SHA-256 of all sources of the package, except of the packages ``without``."""
+    """SHA-256 of all sources except packages ``without``."""
     import dudmap
 
     root = Path(dudmap.__file__).parent
@@ -280,7 +272,7 @@ COLUMNS = (
 
 
 def markdown(rows: list[Row]) -> str:
-    """Markdown table of the rows, followed by a list of the failed ones."""
+    """Markdown table of rows, then the failed ones."""
     good = [row for row in rows if "error" not in row]
     used = [column for column in COLUMNS if any(row.get(column.key) is not None for row in good)]
     header = ["sequence", "system", *(column.heading for column in used)]
@@ -293,7 +285,7 @@ def markdown(rows: list[Row]) -> str:
 
 
 def save(rows: list[Row] | None, text: str, out: Path, name: str, more: Row | None = None) -> Row:
-    """Write <name>.md, <name>.json and, for rows, <name>.csv, in stored units; return the JSON content."""
+    """Write <name>.md, .json and, for rows, .csv; return the JSON content."""
     out.mkdir(parents=True, exist_ok=True)
     (out / f"{name}.md").write_text(text, encoding="utf-8")
     content: Row = {"machine": machine(), "versions": versions(), **(more or {})}

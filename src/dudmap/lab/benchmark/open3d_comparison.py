@@ -1,7 +1,4 @@
-"""Open3D's dense SLAM and dudmap on the same frames and machine, alternately.
-
-A failing program raises a ``DudmapError``.
-"""
+"""Open3D's dense SLAM and dudmap alternately on the same frames. Failures raise a ``DudmapError``."""
 
 import json
 import subprocess
@@ -23,14 +20,14 @@ from dudmap.io.sequences import Sequence
 from dudmap.lab.benchmark.measure import Row, in_own_process
 
 ROUNDS = 3
-"""Number of alternating runs of each system, so that a varying load affects both."""
+"""Alternating runs of each system."""
 WARM_UP = 10
-"""Number of frames at the start of a run that are not timed."""
+"""First frames of a run, not timed."""
 
 
 class Comparison(NamedTuple):
-    """Median times per frame (ms), ATE RMSE of the last round (m; None without ground truth), frames, version of
-    Open3D."""
+    """Median times per frame (ms), ATE RMSE of the last round (m; None without ground truth), frames, Open3D's
+    version."""
 
     ours_ms: float
     theirs_ms: float
@@ -41,10 +38,9 @@ class Comparison(NamedTuple):
 
 
 def compare_with_open3d(python: Path, sequence: Sequence, frames: int, rounds: int = ROUNDS) -> Comparison:
-    """Run both systems alternately on the first frames of a recording; ``python`` is an interpreter that has open3d.
+    """Run both systems on the first frames of a recording; ``python``: interpreter with open3d.
 
-    Times include pose estimation and fusion, not image decoding. Both systems have the same voxel size and largest
-    depth; dudmap has its default configuration with dynamic labels.
+    Times include pose and fusion, not decoding. Voxel size and largest depth are equal; dudmap labels by default.
     """
     count = min(frames, len(sequence))
     if count < 2:

@@ -1,10 +1,9 @@
-"""Open3D's dense SLAM (t.pipelines.slam) on frames in a folder; a separate program that needs only open3d and numpy.
+"""Open3D's dense SLAM (t.pipelines.slam) on frames in a folder; needs only open3d and numpy.
 
 python open3d_slam.py FOLDER VOXEL_SIZE DEPTH_MAX
 
 FOLDER holds depth.npy (N, H, W) uint16, color.npy (N, H, W, 3) uint8 and camera.json with fx, fy, cx, cy and
-depth_scale. Steps and values follow Open3D's example dense_slam.py. Prints one JSON object: version, ms per frame,
-poses.
+depth_scale. As Open3D's example dense_slam.py. Prints JSON: version, ms per frame, poses.
 """
 
 import json

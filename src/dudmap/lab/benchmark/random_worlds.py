@@ -1,4 +1,4 @@
-"""Random worlds with random sensors: frequency and size of failures, reported and silent."""
+"""Random worlds with random sensors: failures, reported and silent."""
 
 import hashlib
 from collections.abc import Callable, Iterable
@@ -14,9 +14,9 @@ from dudmap.lab.benchmark.suites import Entry
 from dudmap.lab.data import tables
 
 SILENT_ATE, SILENT_LOST = 0.05, 0.2
-"""A silent failure has an ATE RMSE above SILENT_ATE metres with less than the share SILENT_LOST of the frames lost."""
+"""A silent failure: ATE RMSE above SILENT_ATE metres, less than SILENT_LOST of the frames lost."""
 NAMED, FAULTY, BLURRED = 0.4, 0.3, 0.3
-"""Probability of a named camera, of each fault of any other sensor, and of its motion blur."""
+"""Probability of a named camera, of each other fault, and of motion blur."""
 DRAWN = tables("benchmark/random_worlds.toml")
 
 
@@ -30,7 +30,7 @@ def _rounded(value: Any) -> Any:  # noqa: ANN401 - a number or a tuple of number
 
 
 def draw_world(seed: int, number: int) -> dict[str, Any]:
-    """Arguments of ``dudmap.lab.synthetic.sequence`` (as ``Entry.parameters``) of world ``number`` of a seed."""
+    """Arguments of ``dudmap.lab.synthetic.sequence`` of world ``number`` of a seed."""
     rng = np.random.default_rng([seed, number])
 
     def one_of(kind: str) -> str:
@@ -73,10 +73,10 @@ def measure_worlds(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """One row per world, in the order of their numbers; ``done`` is called with each new row.
+    """One row per world, in order; ``done`` receives each row.
 
-    Each row is written to seed-<seed>-<fingerprint>.jsonl in ``out`` at once. Worlds of the same code and configuration
-    in that file are not measured again.
+    Rows are written at once to seed-<seed>-<fingerprint>.jsonl in ``out``; those of the same code and configuration are
+    reused.
     """
     out.mkdir(parents=True, exist_ok=True)
     fingerprint = hashlib.sha256(f"{code_hash()}{config.to_toml()}".encode()).hexdigest()[:8]
@@ -99,7 +99,7 @@ def is_silent_failure(row: Row) -> bool:
 
 
 def report(rows: list[Row], seed: int) -> str:
-    """Markdown: the distribution of the ATE, the silent failures, and the worst worlds."""
+    """Markdown: distribution of the ATE, silent failures, worst worlds."""
     measured = [row for row in rows if row.get("ate_rmse_m") is not None]
     measured.sort(key=lambda row: -row["ate_rmse_m"])
     failed = [row for row in rows if row.get("ate_rmse_m") is None]

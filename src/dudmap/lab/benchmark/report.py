@@ -1,4 +1,4 @@
-"""Report of a suite: measured metrics, results of other systems and published metrics in one document."""
+"""Report of a suite: measured, other systems' and published metrics."""
 
 import math
 from collections.abc import Callable, Collection, Mapping
@@ -17,7 +17,7 @@ from dudmap.lab.data import tables
 
 
 class Published(NamedTuple):
-    """One published metric: recording, system, key in tables, value in their unit (m, m/s, deg/s), publication."""
+    """One published metric: recording, system, key, value in unit (m, m/s, deg/s), publication."""
 
     sequence: str
     system: str
@@ -27,7 +27,7 @@ class Published(NamedTuple):
 
 
 def published(sequences: Collection[str] | None = None) -> list[Published]:
-    """Published metrics (``published.toml``) of all or of the given recordings, in the order of the data file."""
+    """Published metrics (``published.toml``) of all or given recordings."""
     content = tables("benchmark/published.toml")
     sources = content["sources"]
     return [
@@ -48,10 +48,10 @@ def run_suite(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
 ) -> tuple[Row, str]:
-    """Measure a suite; write <suite>.md, .csv and .json into ``out``; return the JSON content and the Markdown.
+    """Measure a suite; write <suite>.md, .csv and .json into ``out``; return JSON content and Markdown.
 
-    Runs are kept in ``out``/runs/<system>/<sequence>, except for the suite ``limits``. ``others`` are folders
-    with results of other systems by name: FOLDER/<sequence>/trajectory.txt and mesh.ply.
+    Runs stay in ``out``/runs/<system>/<sequence>, except ``limits``. ``others``: folders of other systems,
+    FOLDER/<sequence>/trajectory.txt and mesh.ply.
     """
     kept = None if suite.name == "limits" else out / "runs"
     jobs = [
@@ -126,7 +126,7 @@ def _missing(suite: Suite) -> str:
 
 
 def comparison_tables(rows: list[Row], printed: list[Published], suite: Suite) -> str:
-    """One Markdown table per published metric: measured systems in bold, then published ones with their source."""
+    """Markdown table per published metric: measured systems bold, then published ones."""
     text, sources = "", list(dict.fromkeys(value.source for value in printed))
     for column in COLUMNS:
         values = [value for value in printed if value.metric == column.key]

@@ -1,4 +1,4 @@
-"""A long run in one room: growth of time, memory and error over many frames."""
+"""A long run in one room: growth of time, memory and error."""
 
 import tempfile
 import time
@@ -26,11 +26,11 @@ from dudmap.lab.benchmark.suites import Entry
 FPS = 15.0
 """Frame rate of the recording, Hz."""
 MORE = 1.1
-"""Largest growth of time and memory from the second tenth to the last."""
+"""Largest growth of time and memory, second tenth to last."""
 
 
 class Rendered:
-    """Recording that sums the processor time of rendering, to subtract it."""
+    """Recording that sums rendering time."""
 
     def __init__(self, recording: Sequence) -> None:
         self._recording, self.rendered = recording, 0.0
@@ -48,7 +48,7 @@ class Rendered:
 
 
 class Tenths(RunObserver):
-    """Metrics of each tenth of a run; poses are aligned by the first one."""
+    """Metrics of each tenth of a run."""
 
     def __init__(self, recording: Rendered, done: Callable[[Row], None]) -> None:
         self.rows: list[Row] = []
@@ -81,12 +81,11 @@ class Tenths(RunObserver):
 
 
 def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[Row], None]) -> list[Row]:
-    """Process a room with people at 15 Hz; the camera swings on an arc once in 20 s, and the noise never repeats.
+    """Process a room with people at 15 Hz; the camera swings once in 20 s, noise never repeats.
 
     Returns:
-        One row per tenth of the run: processor time and time per frame (medians), memory of the process, blocks of the
-            map, size of the run folder, frames lost so far, and the largest error of a pose. ``done`` receives each row
-            as soon as it is complete.
+        Per tenth: processor time and time per frame (medians), memory, map blocks, run folder's size, lost frames,
+            largest pose error; ``done`` receives each row.
     """
     world = {"movers": ("people",), "camera_path": "orbit", "frames": frames, "fps": FPS, "seed": seed, "camera": size}
     recording = Rendered(Entry("room-people", parameters=world).open())
@@ -98,7 +97,7 @@ def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[
 
 
 def grown(rows: list[Row]) -> list[str]:
-    """Quantities that grew from the second tenth to the last: time or memory by over 10 %, error by half a voxel."""
+    """Grown quantities: time or memory by 10 %, error by half a voxel."""
     early, late = rows[1], rows[-1]
     found = [f"{key} {late[key] / early[key]:.2f} times" for key in ("cpu_ms", "memory_mb")
              if late[key] > MORE * early[key]]  # fmt: skip

@@ -1,7 +1,4 @@
-"""Speed and memory on this machine, compared with targets; each measurement runs in a new process.
-
-A failing measurement raises a ``DudmapError``.
-"""
+"""Speed and memory against targets, in new processes. Failures raise a ``DudmapError``."""
 
 import os
 import statistics
@@ -30,11 +27,11 @@ if TYPE_CHECKING:
 
 WARM_UP = 10
 FRAME_TARGETS = {0.01: 20.0, 0.02: 14.0, 0.005: 40.0}
-"""Largest acceptable median time per frame, milliseconds, by voxel size, metres."""
+"""Largest acceptable median ms per frame, by voxel size, metres."""
 
 
 class SpeedFigure(NamedTuple):
-    """One row of the table: quantity, unit, largest acceptable value (None = no target), and measured value."""
+    """Quantity, unit, largest acceptable value (None = no target), measured value."""
 
     what: str
     unit: str
@@ -49,10 +46,10 @@ def speed_figures(
     open3d: Path | None = None,
     recording: Path | None = None,
 ) -> list[SpeedFigure]:
-    """Measure all quantities; ``announce`` is called with a description of the next measurement.
+    """Measure all quantities; ``announce`` receives the next measurement.
 
     Args:
-        open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
+        open3d: Interpreter with Open3D, for the comparison; None skips it.
     """
     figures, compared = list[SpeedFigure](), list[SpeedFigure]()
     if open3d is not None:  # first, because the other program may not start
@@ -107,7 +104,7 @@ def markdown(figures: list[SpeedFigure]) -> str:
 
 
 def stages() -> str:
-    """Table of the cost of an ordinary frame's stages in the same room, see ``calls.stage_table``."""
+    """Cost of an ordinary frame's stages, see ``calls.stage_table``."""
     return _measured(_stages, COUNTED_FROM + 20)["table"]
 
 
@@ -144,11 +141,10 @@ with compiling:
         observers=(First(),),
     )
 """
-"""Program that ends at the first computed pose, of the second frame; the first pose is the identity."""
+"""Program that ends at the first computed pose, of the second frame."""
 
 
 def _start_times() -> list[SpeedFigure]:
-    """Times of import, help page, and start to the first pose."""
     from dudmap.lab.synthetic.folder import write_folder
 
     figures = [
@@ -167,7 +163,7 @@ def _start_times() -> list[SpeedFigure]:
 
 
 def program_seconds(arguments: list[str], times: int = 5, **variables: str) -> float:
-    """Median duration of a Python program with environment variables, seconds."""
+    """Median duration of a Python program, seconds."""
     seconds = []
     for _ in range(times):
         start = time.perf_counter()
@@ -184,8 +180,6 @@ def _room(frames: int) -> "Sequence":
 
 
 def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
-    """Process a recording; yield the system and the time of every frame, ms, without rendering. As in a run the next
-    frame is prepared meanwhile."""
     from dudmap.core.slam import Slam
 
     slam = Slam(sequence.camera, config)
@@ -201,10 +195,10 @@ def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[t
 
 
 def time_frames(job: tuple[float, int]) -> Row:
-    """Times of the frames of a recording, and of extracting and rendering the resulting map.
+    """Times of the frames of a recording, and of mesh and view.
 
     Args:
-        job: Voxel size in metres, and number of frames.
+        job: Voxel size in metres, number of frames.
     """
     voxel, frames = job
     slam, times, sequence = None, [], _room(frames + 1)
@@ -223,7 +217,6 @@ def time_frames(job: tuple[float, int]) -> Row:
 
 
 def _time_again(slam: "Slam", frame: "Frame") -> Row:
-    """Time of the incremental mesh extraction after one more frame, and number of updated chunks."""
     from dudmap.core.map.incremental_mesh import IncrementalMesh
 
     live = IncrementalMesh(slam.volume)
@@ -235,7 +228,7 @@ def _time_again(slam: "Slam", frame: "Frame") -> Row:
 
 
 def median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
-    """Median duration after one call for warm-up, and the last result."""
+    """Median duration after a warm-up call, and the last result."""
     result, seconds = action(), []
     for _ in range(times):
         start = time.perf_counter()
@@ -245,8 +238,7 @@ def median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
 
 
 def time_iteration(frames: int) -> Row:
-    """Time of one linearisation of the 320 pixels wide level against the map of some frames, on the thread of this
-    process."""
+    """Time of a linearisation at 320 pixels width, one thread."""
     os.environ["DUDMAP_THREADS"] = "1"
     from dudmap.core.frames.observation import Level
 

@@ -1,7 +1,4 @@
-"""Measure the reaction of a run to faults of its input stream.
-
-An unknown fault, or a recording without true poses, raises a ``ConfigError``.
-"""
+"""Measure the reaction of a run to stream faults. Unknown faults, or no true poses, raise a ``ConfigError``."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -22,10 +19,10 @@ from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
 
 SILENT_ERROR = 0.03
-"""Smallest error of a wrong pose, metres, and at least ``SILENT_RATIO`` times the largest error without the fault."""
+"""Smallest error of a wrong pose, metres, and ``SILENT_RATIO`` times the largest one without fault."""
 SILENT_RATIO = 3.0
 LAST_FRAMES = 5
-"""Number of last frames without a pose at which a stream is lost to the end."""
+"""Last frames without a pose of a lost stream."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +30,9 @@ class FaultRun:
     """Result of a stream with a fault.
 
     Attributes:
-        lost, maps: Numbers of lost frames and of submaps in the end.
-        errors: (N,) position error per arrived frame, metres; NaN without a pose.
-        flagged: (N,) bool, poses that the run itself reports as doubtful: ``FrameResult.blind``, ``uncertain`` or
-            repeated.
+        lost, maps: Lost frames, submaps.
+        errors: (N,) position error per frame, metres; NaN without a pose.
+        flagged: (N,) bool, doubtful poses: ``FrameResult.blind``, ``uncertain`` or repeated.
     """
 
     fault: str
@@ -47,12 +43,12 @@ class FaultRun:
     flagged: NDArray[np.bool_]
 
     def wrong(self, clean: "FaultRun") -> tuple[int, int]:
-        """Numbers of wrong tracked poses: not flagged, and flagged as doubtful."""
+        """Numbers of wrong poses: unflagged, and flagged."""
         wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
         return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
 
     def frames_to_recovery(self) -> int | None:
-        """Longest sequence of arrived frames without a pose; None if the last LAST_FRAMES have none."""
+        """Longest run of frames without a pose; None if the last LAST_FRAMES lack one."""
         without, longest = 0, 0
         for missing in np.isnan(self.errors):
             without = without + 1 if missing else 0
@@ -60,7 +56,7 @@ class FaultRun:
         return None if without >= LAST_FRAMES else longest
 
     def outcome(self, clean: "FaultRun") -> str:
-        """Outcome in words; begins with FAILED if a wrong pose counts as tracked, or tracking stays lost."""
+        """Outcome; FAILED for unflagged wrong poses or a lost stream."""
         if self.wrong(clean)[0]:
             return "FAILED: wrong poses are called tracked"
         if self.frames_to_recovery() is None:
@@ -71,7 +67,7 @@ class FaultRun:
 
 
 def default_room(frames: int, width: int, seed: int) -> Sequence:
-    """A synthetic room with a person, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+    """A room with a person, 4:3 images of 62 degrees, a Kinect's noise."""
     from dudmap.lab import synthetic
 
     camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), depth_scale=1000.0)
@@ -81,10 +77,10 @@ def default_room(frames: int, width: int, seed: int) -> Sequence:
 def measure_stream_faults(
     recording: Sequence, config: Config, faults: list[str] | None = None, frames: int | None = None
 ) -> Iterator[tuple[FaultRun, FaultRun]]:
-    """Run the system over a recording without a fault and with each named fault (none: all).
+    """Run the system without a fault and with each named fault (none: all).
 
     Yields:
-        A run as soon as it ends, and the run without a fault, which is the first.
+        A run, and the faultless one, which is the first.
     """
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
@@ -98,9 +94,9 @@ def measure_stream_faults(
 
 
 def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
-    """Process a stream and compare every pose with the true pose of its frame.
+    """Process a stream and compare every pose with the true one.
 
-    The poses of each submap are aligned by its first pose.
+    Submaps are aligned by their first poses.
     """
     slam = Slam(stream.camera, config, calibration=stream.calibration)
     truth = _true_poses(stream)
@@ -142,7 +138,7 @@ def table_head(name: str, frames: int) -> str:
 
 
 def fault_row(run: FaultRun, clean: FaultRun) -> str:
-    """Line of the table; errors are of the tracked poses."""
+    """Table line; errors of tracked poses."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(run.rejected.items())) or "0"
     errors, recovery = 1000 * run.errors[np.isfinite(run.errors)], run.frames_to_recovery()
     cells = [run.fault, FAULTS[run.fault].description, run.outcome(clean), len(run.errors), kinds, run.lost,

@@ -1,7 +1,5 @@
-"""Recordings of a benchmark, the suites they belong to, and the systems compared; suites.toml lists them.
-
-An unknown name raises a ``ConfigError``, a folder without recordings a ``DatasetError``.
-"""
+"""Recordings, suites and systems of a benchmark (suites.toml). Unknown names raise a ``ConfigError``, folders without
+recordings a ``DatasetError``."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -29,10 +27,9 @@ class Entry:
     """One recording of a suite.
 
     Attributes:
-        parameters: Arguments of ``lab.synthetic.sequence``. ``camera`` is (width, height) in pixels, ``faults`` maps
-            fields of ``SensorFaults`` that differ from the sensor's.
-        parts: Boxes (x0, y0, z0, x1, y1, z1) by name, metres, world frame of the ground truth. Completeness is also
-            measured in each.
+        parameters: Of ``lab.synthetic.sequence``; ``camera``: (width, height) pixels; ``faults``: differing fields of
+            ``SensorFaults``.
+        parts: Boxes (x0, y0, z0, x1, y1, z1) by name, metres, ground truth frame, for completeness.
     """
 
     name: str
@@ -53,7 +50,7 @@ class Entry:
         return sequence(**self.parameters)
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
-        """True static surface and its observed part, in the frame of the ground truth, if known."""
+        """True static surface and observed part, ground truth frame, if known."""
         from dudmap.lab.synthetic.recording import SyntheticSequence
 
         if isinstance(sequence, SyntheticSequence):
@@ -63,7 +60,7 @@ class Entry:
 
 
 def local_entries(data: Path) -> list[Entry]:
-    """Every recording in a folder, or the folder itself if it is a recording."""
+    """Recordings in a folder, or itself."""
     from dudmap.io.sequences import is_recording
 
     if not data.is_dir():
@@ -76,7 +73,7 @@ def local_entries(data: Path) -> list[Entry]:
 
 
 class Excerpt:
-    """The first ``frames`` frames of a recording (None: all), each read or rendered once."""
+    """The first ``frames`` frames of a recording (None: all), read once."""
 
     def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
         self.recording, self.timestamps = recording, recording.timestamps[:frames]
@@ -110,14 +107,14 @@ PARTS: dict[str, dict[str, Box]] = DATA["parts"]
 SYSTEMS: dict[str, tuple[str, ...]] = DATA["systems"]
 PASSES = {"two-passes": 2}
 UNCALIBRATED = ("colour-as-given",)
-"""Systems that use the recording's colour camera; the others calibrate it first."""
+"""Systems that do not calibrate the colour camera."""
 USUAL = {
     "ablation": ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))]),
     "sensors": "colour-as-given,no-colour,dudmap",
     "limits": "dudmap,none",
     "fence": "voxel-5mm,voxel-1cm,voxel-2cm,voxel-2cm-16m",
 }
-"""Default systems of a suite; other suites have only the default system."""
+"""Systems of a suite, if not the default alone."""
 QUICK = ("room-static", "room-person", "room-people-at-start", "two-people", "speed-1.0-50", "camera_path-still-30")
 
 
@@ -130,7 +127,7 @@ class Suite:
     missing: list[Entry]
 
     def names(self) -> list[str]:
-        """Names of all recordings of the suite, found or not."""
+        """Names of all recordings, found or not."""
         return [entry.name for entry in [*self.entries, *self.missing]]
 
 
@@ -138,8 +135,8 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     """Find the recordings of one of ``SUITES``.
 
     Args:
-        data: Folder that is searched, two levels deep, or one recording; synthetic worlds need none.
-        quick: A few synthetic worlds, in images of 320x240, and at most 60 frames of every recording.
+        data: Searched folder, two levels deep, or a recording.
+        quick: A few worlds at 320x240, and 60 frames of recordings.
     """
     find(name, SUITES, "suite")
     missing: list[Entry] = []
@@ -167,7 +164,6 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
-    """Entries whose folder or archive is ``data``, in it or one level below, and the missing ones."""
     places = [*(path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern))), data.absolute()]
     found = {stem(path): path for path in places if is_archive(path)} | {p.name: p for p in places if p.is_dir()}
     for name in list(found):
@@ -177,7 +173,7 @@ def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]
 
 
 def systems(names: str) -> dict[str, Config]:
-    """Configurations by name, from a comma-separated list of ``SYSTEMS`` and of paths of TOML files."""
+    """Configurations by name: comma-separated ``SYSTEMS`` and TOML files."""
     found: dict[str, Config] = {}
     for name in (name.strip() for name in names.split(",") if name.strip()):
         if name not in SYSTEMS and not name.endswith(".toml"):

@@ -1,4 +1,4 @@
-"""Fidelity of a textured mesh: views that gave it no colour, against its rendering and that of vertex colours."""
+"""Fidelity of a textured mesh at held-out views, against vertex colours."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +18,11 @@ from dudmap.io.texturing.baking import TexturedMesh, textured
 from dudmap.io.texturing.views import STRIDE, Views, aligned, drawn, groups, hit
 
 HELD_OUT = 8
-"""Every so many groups of views is held out."""
+"""Groups of views per held-out one."""
 INNER = 0.25
-"""Weight of compared pixels: masks and depth edges are 6 of 640 pixels away."""
+"""Weight of compared pixels, away from masks and depth edges."""
 FINER = 2
-"""Rendered pixels per pixel of an image, in both directions."""
+"""Rendered pixels per image pixel, across and down."""
 BACKGROUND = 32
 """Grey value of pixels without surface."""
 
@@ -32,9 +32,9 @@ class TextureFidelity:
     """Result of ``measure_texture``.
 
     Attributes:
-        views: Number of held-out views.
-        texture_db, vertices_db: Peak signal-to-noise ratio of the textured mesh and of vertex colours, dB.
-        seen: Share of the texels of the surface that a view shows.
+        views: Held-out views.
+        texture_db, vertices_db: Peak signal-to-noise ratios, dB.
+        seen: Share of texels that a view shows.
     """
 
     views: int
@@ -44,12 +44,11 @@ class TextureFidelity:
 
 
 def measure_texture(run: RunContent, options: ExportOptions, sheet: Path | None = None) -> TextureFidelity:
-    """Texture a mesh from seven of eight groups of views, and render it at the poses of the others.
+    """Texture a mesh from seven of eight groups of views, and render it at the others.
 
-    Compared are pixels that are static, have a measured depth that agrees with the mesh, are covered by both meshes,
-    and are not next to a mask or a depth edge, where errors of the shape would count. Each image is registered to each
-    rendering, which takes the gain per channel that fits best. The vertex colours are of the full mesh, and of all
-    frames. ``sheet`` receives rows of recorded image, vertex colours and texture.
+    Compared are static pixels of agreeing depth, covered by both meshes, away from masks and depth edges. Each image is
+    registered to each rendering, with the best gain per channel. Vertex colours are of the full mesh and all frames.
+    ``sheet``: rows of recorded image, vertex colours, texture.
     """
     recording = images_of(run, options)
     frames = groups(run, recording, options.every)
@@ -89,7 +88,7 @@ def measure_texture(run: RunContent, options: ExportOptions, sheet: Path | None 
 def rendered(
     mesh: Mesh | TexturedMesh, T_world_camera: NDArray[np.float64], camera: Camera
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colour (h, w, 3) of a mesh, and the pixels (h, w) that it covers."""
+    """Colour (h, w, 3) of a mesh, and covered pixels (h, w)."""
     fine = camera.resized(FINER * camera.width, FINER * camera.height)
     surface = mesh.mesh if isinstance(mesh, TexturedMesh) else mesh
     triangles, depth = drawn(surface, T_world_camera, fine)

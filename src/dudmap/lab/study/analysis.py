@@ -1,7 +1,4 @@
-"""Analysis of the runs of a study, response by response, as a report.
-
-A response that no run has raises a ``ConfigError``.
-"""
+"""Analysis of a study, response by response, as a report. Missing responses raise a ``ConfigError``."""
 
 from typing import TYPE_CHECKING
 
@@ -18,13 +15,13 @@ if TYPE_CHECKING:
 
 MOST_FAILURES = 10
 ENOUGH_TRACKED = 0.9
-"""Share of tracked frames below which a run is listed as having lost frames."""
+"""Share of tracked frames below which a run is listed."""
 MOST_POINTS = 100
 MOST_INTERACTION_FACTORS = 6
 
 
 def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> Table | None:
-    """Add the analysis of one response without its confirmation; return the effects of a Plackett-Burman design."""
+    """Add the analysis of one response; return the effects of a Plackett-Burman design."""
     scale, factors = plan.scale(name), plan.factors
     report.heading(scale.heading)
     data = scale.usable(table)
@@ -52,7 +49,7 @@ def describe_response(report: Report, plan: "Plan", table: Table, name: str) -> 
 
 
 def describe_surface(report: Report, predicted: Prediction) -> None:
-    """Add the quadratic model, its optimum and the doubts about it."""
+    """Add the quadratic model, its optimum and doubts."""
     surface, best = predicted.surface, predicted.best
     report.text(
         f"Full quadratic model: R2 = {surface.r2:.2f}, {surface.r2_predicted:.2f} by leave-one-out, "
@@ -69,7 +66,7 @@ def describe_surface(report: Report, predicted: Prediction) -> None:
 
 
 def point_table(plan: "Plan", table: Table) -> Table:
-    """Mean responses, in the units of the report, of every point without failed runs."""
+    """Mean responses of every point without failed runs."""
     known = {name: RESPONSES[name] for name in plan.responses if RESPONSES[name].key in table}
     complete = table.dropna(subset=[response.key for response in known.values()])
     sizes = complete.groupby("point")["run"].transform("size")
@@ -81,7 +78,7 @@ def point_table(plan: "Plan", table: Table) -> Table:
 
 
 def describe_points(report: Report, plan: "Plan", table: Table) -> None:
-    """Add the means of all points, the best of the first response on top."""
+    """Add the means of all points, best first."""
     points = point_table(plan, table)
     known = [name for name in plan.responses if name in points]
     if not known or len(points) > MOST_POINTS:
@@ -92,7 +89,7 @@ def describe_points(report: Report, plan: "Plan", table: Table) -> None:
 
 
 def describe_losses(report: Report, table: Table) -> None:
-    """Add the runs that lost many frames, because their errors cover tracked frames only and may look small."""
+    """Add the runs that lost many frames, whose errors may look small."""
     if "tracked_share" not in table or not (table["tracked_share"] < ENOUGH_TRACKED).any():
         return
     partial = table[table["tracked_share"] < ENOUGH_TRACKED]
@@ -105,7 +102,7 @@ def describe_losses(report: Report, table: Table) -> None:
 
 
 def describe_failures(report: Report, table: Table) -> None:
-    """Add the failed runs, which are missing from all metrics above."""
+    """Add the failed runs."""
     if "error" not in table or table["error"].isna().all():
         return
     failed = table[table["error"].notna()]

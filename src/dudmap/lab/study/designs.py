@@ -1,7 +1,4 @@
-"""Factors of a study (configuration keys with levels or a range), and designs, which choose their combinations.
-
-Errors in a design file raise a ``ConfigError``.
-"""
+"""Factors of a study (keys with levels or a range), and designs. Errors raise a ``ConfigError``."""
 
 import json
 from collections.abc import Collection, Mapping, Sequence
@@ -18,7 +15,7 @@ from dudmap.errors import ConfigError
 
 Value = float | int | bool | str | list[Any]
 Table = Any
-"""A pandas DataFrame or Series. Type checkers cannot follow which of its many types an expression of pandas has."""
+"""A pandas DataFrame or Series, which type checkers cannot follow."""
 
 
 @dataclass(frozen=True)
@@ -26,10 +23,9 @@ class Factor:
     """A configuration key with its levels or its range.
 
     Attributes:
-        levels: The levels in the order given; empty for a range.
-        low, high: Coded values -1 and +1: ends of the range, or smallest and largest level; NaN if levels are no
-            numbers.
-        scale: Whether the coded value is linear in the value or in its logarithm.
+        levels: As given; empty for a range.
+        low, high: Coded -1 and +1: ends of the range, or extreme levels; NaN without numbers.
+        scale: Linear in the value or its logarithm.
     """
 
     key: str
@@ -41,7 +37,7 @@ class Factor:
 
     @property
     def numeric(self) -> bool:
-        """Whether the factor has a low and a high end."""
+        """Whether the factor has two ends."""
         return bool(np.isfinite(self.low))
 
     @property
@@ -55,7 +51,7 @@ class Factor:
         return (values - (low + high) / 2) / ((high - low) / 2)
 
     def value(self, coded: float) -> float | int:
-        """Value in the units of the key, inside the range; rounded if the key needs a whole number."""
+        """Value inside the range in the key's units, rounded for whole numbers."""
         low, high = self._transformed(self.low), self._transformed(self.high)
         number = float((low + high) / 2 + coded * (high - low) / 2)
         number = float(np.exp(number)) if self.scale == "log" else number
@@ -77,7 +73,7 @@ def configured(base: Config, values: Mapping[str, Value]) -> Config:
 
 
 def make_factor(key: str, given: object, base: Config) -> Factor:
-    """Factor of one line of a design file: a list of levels, or a table with ``levels`` or ``range``, and ``scale``."""
+    """Factor of a line of a design file: levels, or a table with ``levels`` or ``range``, and ``scale``."""
     table = {"levels": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or len({"levels", "range"} & set(table)) != 1:
         raise ConfigError(f"factor {key} is {given!r}; expected a list of levels, or range = [low, high]")
@@ -103,10 +99,7 @@ def make_factor(key: str, given: object, base: Config) -> Factor:
 
 
 def make_factors(table: Mapping[str, object], base: Config) -> tuple[Factor, ...]:
-    """Factors of the table ``factors`` of a design file, whose keys are quoted or nested.
-
-    ``all_numeric`` adds every numeric key (``numeric_factors``).
-    """
+    """Factors of the table ``factors``; ``all_numeric`` adds ``numeric_factors``."""
     flat: dict[str, object] = {}
     for key, given in table.items():
         nested = isinstance(given, dict) and key != "all_numeric" and not {"levels", "range"} & set(given)
@@ -137,9 +130,8 @@ class DesignOptions(BaseModel):
     """Table ``design`` of a design file.
 
     Attributes:
-        samples: Number of points of a Latin hypercube.
-        foldover: Whether a Plackett-Burman design is followed by its mirror image, which makes the effects free of
-            interactions of two factors.
+        samples: Points of a Latin hypercube.
+        foldover: Append the mirror image of a Plackett-Burman design, which frees effects of two-factor interactions.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -168,7 +160,7 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
 
 
 def count_of(factors: Sequence[Factor], options: DesignOptions) -> int:
-    """Number of points of a design, without creating a large design."""
+    """Points of a design, without creating it."""
     if options.kind == "full-factorial":
         return int(np.prod([max(len(factor.levels), 1) for factor in factors], dtype=object))
     by_kind = {
@@ -220,14 +212,12 @@ def _latin_hypercube(factors: Sequence[Factor], options: DesignOptions) -> Coded
 
 
 def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -> tuple[Factor, ...]:
-    """Every numeric key as a factor between its value divided by a ratio and its value times the ratio.
+    """Every numeric key as a factor, divided and multiplied by a ratio.
 
-    - Both ends are kept inside the bounds of the key; for an exclusive bound, the end lies halfway between value and
-      bound.
+    - Ends stay inside the bounds; at an exclusive bound halfway.
     - A whole number changes by 1 at least.
-    - All elements of a list change together, with two levels.
-    - Keys with the value 0, keys ``chosen`` by the design file, and keys in its table (``ratio``, ``without``) are
-      skipped.
+    - Elements of a list change together.
+    - Keys of value 0, ``chosen``, or in the table (``ratio``, ``without``) are skipped.
     """
     if not isinstance(given, dict) or set(given) - {"ratio", "without"}:
         raise ConfigError(f"all_numeric is {given!r}; expected, for example, all_numeric = {{ ratio = 1.5 }}")
@@ -274,7 +264,7 @@ def _scaled(value: float, factor: float) -> float:
 
 
 def bounds_of(key: str) -> dict[str, float]:
-    """Bounds of a numeric key by their kind: ``ge``, ``gt``, ``le``, ``lt``."""
+    """Bounds of a numeric key: ``ge``, ``gt``, ``le``, ``lt``."""
     section, _, name = key.rpartition(".")
     found = type(getattr(Config(), section)).model_fields[name].metadata
     return {kind: getattr(item, kind) for item in found for kind in ("ge", "gt", "le", "lt") if hasattr(item, kind)}

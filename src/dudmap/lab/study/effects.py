@@ -1,4 +1,4 @@
-"""Main effects, interactions and analysis of variance of one response."""
+"""Main effects, interactions and analysis of variance."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -10,13 +10,13 @@ from dudmap.lab.study.designs import Factor, Table
 CONFIDENCE = 0.95
 """Level of all confidence intervals."""
 MOST_LEVELS = 6
-"""A factor with more different values than this enters the analysis of variance as a linear term."""
+"""Factors with more values are linear terms of the analysis of variance."""
 
 
 def main_effects(table: Table, factors: Sequence[Factor], response: str) -> Table:
-    """Mean of the response at every level of every factor, with the confidence interval of the mean (Student's t).
+    """Mean at every level of every factor, with confidence interval (Student's t).
 
-    A factor with more than ``MOST_LEVELS`` values is cut into that many groups of equal size.
+    Factors with more than ``MOST_LEVELS`` values are cut into groups.
     """
     import pandas as pd
     from statsmodels.stats.weightstats import DescrStatsW
@@ -31,7 +31,7 @@ def main_effects(table: Table, factors: Sequence[Factor], response: str) -> Tabl
 
 
 def level_groups(values: Table) -> Table:
-    """Level of each run; of a factor with many values, the mean of its group."""
+    """Level of each run, or the mean of its group."""
     import pandas as pd
 
     if values.nunique() <= MOST_LEVELS:
@@ -41,7 +41,7 @@ def level_groups(values: Table) -> Table:
 
 
 def interactions(table: Table, factors: Sequence[Factor], response: str) -> dict[tuple[str, str], Table]:
-    """Means of the response at all pairs of levels of two factors: one table per pair, rows of the first factor."""
+    """Means at all pairs of levels of two factors, rows of the first."""
     out = {}
     for a, b in combinations(factors, 2):
         first, second = level_groups(table[a.key]), level_groups(table[b.key])
@@ -50,13 +50,13 @@ def interactions(table: Table, factors: Sequence[Factor], response: str) -> dict
 
 
 def anova(table: Table, factors: Sequence[Factor], response: str) -> tuple[Table, str] | None:
-    """Analysis of variance with main effects and, if the runs suffice, all interactions of two factors.
+    """Analysis of variance with main effects and, if possible, all two-factor interactions.
 
-    Sums of squares are of type II (statsmodels). Partial eta squared is SS / (SS + SS_residual). Recordings are blocks.
+    Sums of squares are of type II (statsmodels); partial eta squared is SS / (SS + SS_residual); recordings are blocks.
 
     Returns:
-        One row per term (sum of squares, degrees of freedom, F, p, partial eta squared), with the residual last, and
-        the text of the model. None if the runs do not suffice for the main effects, or the response does not vary.
+        One row per term (sum of squares, degrees of freedom, F, p, partial eta squared), residual last, and the model.
+        None with too few runs or no variance.
     """
     import pandas as pd
     from statsmodels.formula.api import ols

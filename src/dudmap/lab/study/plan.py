@@ -1,7 +1,5 @@
-"""Plan of a study: factors, design, recordings and responses of a design file, and the list of all runs.
-
-Errors in a design file raise a ``ConfigError``, unusable recordings a ``DatasetError``.
-"""
+"""Plan of a study from a design file, and all its runs. Errors raise a ``ConfigError``, bad recordings a
+``DatasetError``."""
 
 import hashlib
 import inspect
@@ -24,12 +22,12 @@ from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, c
 from dudmap.lab.study.responses import RESPONSES, Scale, check_truth
 
 MAX_RUNS = 1000
-"""Most runs of a design, unless ``--max-runs`` allows more."""
+"""Most runs, unless ``--max-runs`` allows more."""
 STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
 class TuneOptions(BaseModel):
-    """Table ``tune`` of a design file: number of configurations, and seed of the proposals."""
+    """Table ``tune``: number of configurations, seed."""
 
     model_config = STRICT
 
@@ -48,7 +46,7 @@ class RealTable(BaseModel):
 
 
 class SyntheticTable(BaseModel):
-    """Table ``sequences`` of a synthetic recording, with the parameters that are checked here."""
+    """Table ``sequences`` of a synthetic recording."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -100,11 +98,11 @@ class Run:
     """One run: a point of the design on one recording.
 
     Attributes:
-        point: Number of the point in the design; -1 for a confirmation run.
-        values: Values of the factors by key.
-        entry, sequence, replicate: The recording, its name without the replicate, and the replicate's number.
+        point: Number in the design; -1 for a confirmation.
+        values: By key.
+        entry, sequence, replicate: Recording, name without replicate, replicate number.
         calibrate: Whether the colour camera is calibrated first.
-        code: Hash of the code that runs it.
+        code: Hash of the code.
     """
 
     point: int
@@ -119,7 +117,7 @@ class Run:
 
     @property
     def key(self) -> str:
-        """Hash of all inputs of the result; equal runs share a folder."""
+        """Hash of all inputs; equal runs share a folder."""
         content = [
             self.config.model_dump(), place_of(self.entry), dict(self.entry.parameters), self.entry.max_frames,
             self.calibrate, self.surfaces, self.code,
@@ -132,9 +130,9 @@ class Plan:
     """A study as described by a design file (``docs/study.md``).
 
     Attributes:
-        entries: Recordings: name without the replicate, number of the replicate, and recording.
-        responses: Names of the responses; the first is optimised.
-        judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
+        entries: Name without replicate, replicate number, recording.
+        responses: Names; the first is optimised.
+        judges: Recordings on which ``dudmap study tune`` judges.
     """
 
     name: str
@@ -165,7 +163,7 @@ class Plan:
         ]
 
     def confirmation_runs(self, point: Point) -> list[Run]:
-        """Runs at the predicted optimum: on every real recording, and on synthetic ones with new seeds."""
+        """Runs at the predicted optimum: real recordings, and synthetic ones with new seeds."""
         entries: list[tuple[str, int, Entry]] = []
         for name in self.recordings:
             same = [(replicate, entry) for other, replicate, entry in self.entries if other == name]
@@ -187,7 +185,7 @@ class Plan:
         return Scale(response, response in self.file.log)
 
     def check(self, max_runs: int = MAX_RUNS) -> None:
-        """Check everything that can be known before the first run."""
+        """Check everything known before the first run."""
         count = count_of(self.factors, self.options) * len(self.entries)
         if count > max_runs:
             raise ConfigError(f"the design has {count} runs, more than --max-runs {max_runs}")
@@ -202,7 +200,7 @@ class Plan:
 
 
 def load_plan(path: str | Path) -> Plan:
-    """Plan of a design file; paths of recordings are relative to it."""
+    """Plan of a design file, with relative paths."""
     path = Path(path)
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -214,7 +212,7 @@ def load_plan(path: str | Path) -> Plan:
 
 
 def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study") -> Plan:
-    """Plan of the tree of a design file; see ``load_plan``."""
+    """Plan of a design file's tree."""
     file = checked(DesignFile, tree, "the design")
     base = Config().override(file.base)
     for response in (*file.responses, *file.log):
@@ -235,7 +233,7 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
 
 
 def make_entries(tables: list[dict[str, Any]], folder: Path) -> tuple[tuple[str, int, Entry], ...]:
-    """Recordings of the tables ``sequences`` of a design file: name, replicate and entry of each."""
+    """Name, replicate and entry of the tables ``sequences``."""
     if not tables:
         raise ConfigError('the design has no sequences; expected, for example, [[sequences]] path = "recordings/desk"')
     out: list[tuple[str, int, Entry]] = []
@@ -249,7 +247,7 @@ def make_entries(tables: list[dict[str, Any]], folder: Path) -> tuple[tuple[str,
 
 
 def place_of(entry: Entry) -> str | None:
-    """Absolute path of a recording, or None of a synthetic one."""
+    """Absolute path of a recording, None if synthetic."""
     return None if entry.path is None else str(entry.path.resolve())
 
 

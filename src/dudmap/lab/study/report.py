@@ -1,4 +1,4 @@
-"""Report of a study, in Markdown and HTML, and its figures."""
+"""Report of a study, in Markdown and HTML."""
 
 import base64
 import html
@@ -25,7 +25,7 @@ STYLE = (
 
 
 class Report:
-    """A report in Markdown that is filled from top to bottom."""
+    """A report filled from top to bottom."""
 
     def __init__(self, title: str) -> None:
         self.title = title
@@ -50,13 +50,13 @@ class Report:
         self._parts.append(grid([str(column) for column in frame.columns], rows, words=1))
 
     def figure(self, image: bytes, caption: str) -> None:
-        """Add a figure, the bytes of a PNG file."""
+        """Add a PNG figure."""
         name = f"figures/{len(self._parts)}.png"
         self._figures[name] = image
         self._parts.append(f"![{caption}]({name})\n\n{caption}\n")
 
     def save(self, folder: Path) -> None:
-        """Write report.md, figures/<number>.png, and report.html, which holds them."""
+        """Write report.md, figures/<number>.png, and report.html."""
         from markdown_it import MarkdownIt
 
         (folder / "figures").mkdir(parents=True, exist_ok=True)
@@ -86,7 +86,7 @@ COLORS = 64
 
 
 def png(figure: "Figure") -> bytes:
-    """PNG file of a figure, with a palette: lines and text on white need no more, and it is a quarter of the size."""
+    """PNG file with a palette, a quarter of the size."""
     from PIL import Image
 
     drawn, out = io.BytesIO(), io.BytesIO()
@@ -109,7 +109,7 @@ def _label(level: object) -> str:
 
 
 def main_effects_figure(effects: Table, heading: str) -> bytes:
-    """Mean response at every level of every factor with its confidence interval."""
+    """Mean at every level of every factor, with confidence intervals."""
     keys = list(dict.fromkeys(effects["factor"]))
     figure, axes = _axes(1, len(keys), same_y=True)
     for ax, key in zip(axes[0], keys, strict=True):
@@ -125,7 +125,7 @@ def main_effects_figure(effects: Table, heading: str) -> bytes:
 
 
 def interactions_figure(tables: dict[tuple[str, str], Table], factors: Sequence[Factor], heading: str) -> bytes:
-    """Mean response at all pairs of levels: one plot per pair, one line per level of the factor of the row."""
+    """Mean at all pairs of levels: a plot per pair, a line per row level."""
     count = len(factors)
     figure, axes = _axes(count, count, 2.5, 2.2)
     for row, first in enumerate(factors):
@@ -148,7 +148,7 @@ def interactions_figure(tables: dict[tuple[str, str], Table], factors: Sequence[
 
 
 def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
-    """Prediction along every factor through the optimum, with the interval of the mean."""
+    """Prediction along every factor through the optimum, with intervals."""
     count = len(surface.factors)
     figure, axes = _axes(1, count, same_y=True)
     for n, (ax, factor) in enumerate(zip(axes[0], surface.factors, strict=True)):
@@ -166,7 +166,7 @@ def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
 
 
 def screening_figure(effects: Table, keys: Sequence[str], heading: str) -> bytes:
-    """Effects of the keys on every recording with their intervals; the first key is on top."""
+    """Effects of the keys on every recording, with intervals."""
     recordings = list(dict.fromkeys(effects["recording"]))
     figure, axes = _axes(1, len(recordings), 3.2, 0.24 * len(keys) + 1.0)
     y = np.arange(len(keys))[::-1]

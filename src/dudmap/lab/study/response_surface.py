@@ -1,4 +1,4 @@
-"""Full quadratic response surface (Box and Wilson 1951): fit, optimum, doubts about it, and its confirmation."""
+"""Quadratic response surface (Box and Wilson 1951): fit, optimum, doubts, confirmation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class Surface:
     """Quadratic model y = b0 + sum b_i x_i + sum b_ij x_i x_j in coded units (-1 to 1) of K factors.
 
     Attributes:
-        blocks: Number of columns of the recordings after the P terms.
+        blocks: Columns of the recordings after the P terms.
         observed: (N,) values of the response.
         coded: (N, K) coded values of the runs.
     """
@@ -37,27 +37,27 @@ class Surface:
 
     @property
     def r2(self) -> float:
-        """Share of the variance that the model explains; 0 if all values are equal."""
+        """Explained share of the variance; 0 if all values are equal."""
         return float(self.model.rsquared) if np.ptp(self.observed) > 0 else 0.0
 
     @property
     def r2_predicted(self) -> float:
-        """Share of the variance predicted by leave-one-out (PRESS)."""
+        """Share predicted by leave-one-out (PRESS)."""
         press = self.model.get_influence().resid_press
         return float(1 - np.sum(press**2) / np.sum((self.observed - self.observed.mean()) ** 2))
 
     @property
     def residual_sd(self) -> float:
-        """Standard deviation of the residuals, corrected for the model's degrees of freedom."""
+        """Standard deviation of the residuals, corrected for degrees of freedom."""
         return float(np.sqrt(self.model.mse_resid))
 
     def predict(self, coded: Numbers) -> Numbers:
-        """(N,) predictions at (N, K) coded values, for the mean over all recordings."""
+        """Predictions (N,) at coded values (N, K), mean over recordings."""
         terms = quadratic_terms(coded)
         return terms @ self.model.params[: terms.shape[1]]
 
     def interval(self, coded: Numbers, count: int) -> tuple[float, float, float]:
-        """Prediction at one point, and the interval that should contain the mean of ``count`` new runs."""
+        """Prediction at a point, and interval of the mean of ``count`` new runs."""
         from scipy import stats
 
         frame = self.model.get_prediction(self._exog(coded[None]))
@@ -66,13 +66,13 @@ class Surface:
         return mean, mean - float(half), mean + float(half)
 
     def mean_interval(self, coded: Numbers) -> Numbers:
-        """(N, 3) prediction of the mean at (N, K) coded values, and its confidence interval."""
+        """Predicted mean (N, 3) at coded values (N, K), and confidence interval."""
         frame = self.model.get_prediction(self._exog(coded))
         return np.column_stack([frame.predicted_mean, frame.conf_int(alpha=1 - CONFIDENCE)])
 
     @property
     def point_means(self) -> Numbers:
-        """(M,) mean response of every distinct point over its recordings and replicates."""
+        """Mean (M,) of every distinct point."""
         _, group = np.unique(self.coded.round(9), axis=0, return_inverse=True)
         return np.bincount(group.ravel(), self.observed) / np.bincount(group.ravel())
 
@@ -86,16 +86,14 @@ class Surface:
 
 
 def quadratic_terms(coded: Numbers) -> Numbers:
-    """(N, P) terms of the full quadratic model: 1, x_i, and x_i x_j, of (N, K) coded values."""
+    """Terms (N, P) of coded values (N, K): 1, x_i, x_i x_j."""
     pairs = combinations_with_replacement(coded.T, 2)
     return np.column_stack([np.ones(len(coded)), coded, *(a * b for a, b in pairs)])
 
 
 def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface | str:
-    """Fit the full quadratic model to runs of ``Scale.usable`` by least squares, or return the reason why not.
-
-    Recordings are blocks whose effects sum to zero.
-    """
+    """Fit the quadratic model to ``Scale.usable`` runs, or return why not; recordings are blocks whose effects sum to
+    zero."""
     import pandas as pd
     import statsmodels.api as sm
 
@@ -130,7 +128,7 @@ def values_text(values: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Optimum:
-    """Best prediction within the bounds: coded values (K,), values by key, and predicted response."""
+    """Best prediction: coded values (K,), values by key, response."""
 
     coded: tuple[float, ...]
     values: dict[str, float]
@@ -138,7 +136,7 @@ class Optimum:
 
 
 def optimum(surface: Surface) -> Optimum:
-    """Best prediction inside the bounds: L-BFGS-B (scipy) from the centre and from random points."""
+    """Best prediction inside the bounds: L-BFGS-B (scipy) from several starts."""
     import pandas as pd
     from scipy.optimize import minimize
 
@@ -155,15 +153,15 @@ def optimum(surface: Surface) -> Optimum:
 
 
 ENOUGH_EXPLAINED = 0.5
-"""Smallest share of the variance that a useful model predicts (leave-one-out)."""
+"""Smallest predicted share of the variance (leave-one-out) of a useful model."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Quadratic model of a response, its optimum and the best point of the design.
+    """Quadratic model, its optimum and the best design point.
 
     Attributes:
-        point: Values of all factors at the optimum; factors without numbers have their best level.
+        point: Values at the optimum; best level without numbers.
     """
 
     surface: Surface
@@ -174,7 +172,7 @@ class Prediction:
 
 
 def predict_optimum(data: Table, factors: Sequence[Factor], scale: Scale) -> Prediction | str:
-    """Quadratic model of runs of ``Scale.usable`` and its optimum, or a sentence on why there is none."""
+    """Quadratic model of ``Scale.usable`` runs and its optimum, or why there is none."""
     surface = fit_surface(data, factors, scale)
     if isinstance(surface, str):
         return surface
@@ -196,7 +194,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - a value of a table as plain Pyt
 
 
 def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
-    """Sentences that cast doubt on the optimum of a surface before its confirmation."""
+    """Doubts about an optimum before its confirmation."""
     reasons, scale = [], surface.scale
     if surface.r2_predicted < ENOUGH_EXPLAINED:
         reasons.append(
@@ -219,12 +217,12 @@ def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """Runs at the predicted optimum, and runs at the best point of the design on the same recordings.
+    """Runs at the predicted optimum and at the best design point.
 
     Attributes:
-        predicted, low, high: Predicted mean of ``count`` runs and its interval.
-        design_mean: Mean of all runs of the design: the prediction without a model.
-        measured, best_point: Means of the runs at the optimum and at the best point of the design.
+        predicted, low, high: Mean of ``count`` runs and interval.
+        design_mean: Mean of the design.
+        measured, best_point: Means at the optimum and at the best point.
     """
 
     scale: Scale
@@ -238,17 +236,17 @@ class Confirmation:
 
     @property
     def informative(self) -> bool:
-        """Whether the interval excludes the mean of the design; a wider one would hold for any measurement."""
+        """Whether the interval excludes the design's mean."""
         return not self.low <= self.design_mean <= self.high
 
     @property
     def improves(self) -> bool:
-        """Whether the optimum is at least as good as the best point of the design."""
+        """Whether the optimum is at least as good as the best design point."""
         return self.scale.sign * self.measured <= self.scale.sign * self.best_point
 
     @property
     def held(self) -> bool:
-        """Whether the model held: a correct, informative prediction that improves on the best point."""
+        """Whether the model held: correct, informative, an improvement."""
         return self.low <= self.measured <= self.high and self.informative and self.improves
 
     def __str__(self) -> str:
@@ -265,10 +263,7 @@ class Confirmation:
 
 
 def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_point: Sequence[float]) -> Confirmation:
-    """Compare runs at the optimum (M,), equally many per recording, with the prediction and with the best point.
-
-    ``best_point`` (M,) is the response of runs at the best point of the design, on the same recordings.
-    """
+    """Compare runs at the optimum (M,), equally many per recording, with prediction and best point (M,)."""
     predicted, low, high = surface.interval(np.array(best.coded), len(measured))
     mean, other, usual = (float(np.mean(values)) for values in (measured, best_point, surface.observed))
     return Confirmation(surface.scale, predicted, low, high, usual, mean, other, len(measured))

@@ -1,6 +1,6 @@
-"""Responses of a study: the metric of a run and the requirements on a recording for each.
+"""Responses of a study: metrics and required ground truth.
 
-A response that no run has raises a ``ConfigError``, an unsuitable recording a ``DatasetError``.
+A missing response raises a ``ConfigError``, an unsuitable recording a ``DatasetError``.
 """
 
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 
 class Response(NamedTuple):
-    """One response, with its name and unit in a report.
+    """One response with name and unit.
 
     Attributes:
-        key: Key of the metric in a row of ``dudmap.lab.benchmark.measure``.
-        better: Whether low or high values are good.
-        needs: Ground truth that the recording must have.
+        key: In a row of ``dudmap.lab.benchmark.measure``.
+        better: Low or high.
+        needs: Required ground truth.
     """
 
     key: str
@@ -48,11 +48,11 @@ RESPONSES = {
     "ms": Response("ms_per_frame_median", "time per frame", "ms"),
     "memory": Response("peak_rss_mb", "peak memory", "MB"),
 }
-"""Responses by name; ``docs/evaluation.md`` defines the metrics."""
+"""Responses by name (``docs/evaluation.md``)."""
 
 
 class Scale(NamedTuple):
-    """Analysis of a response: as it is, or as its logarithm."""
+    """Analysis of a response, plain or logarithmic."""
 
     response: str
     log: bool = False
@@ -68,12 +68,12 @@ class Scale(NamedTuple):
         return 1 if RESPONSES[self.response].better == "low" else -1
 
     def plain(self, value: float) -> float:
-        """Analysed value in the unit of the response."""
+        """Analysed value in the response's unit."""
         return float(np.exp(value)) if self.log else float(value)
 
     @property
     def unit(self) -> str:
-        """Unit of an analysed value, which follows its number."""
+        """Unit of an analysed value."""
         return " of the logarithm" if self.log else f" {RESPONSES[self.response].unit}".rstrip()
 
     def text(self, value: float) -> str:
@@ -81,7 +81,7 @@ class Scale(NamedTuple):
         return f"{self.plain(value):.4g} {RESPONSES[self.response].unit}".rstrip()
 
     def usable(self, table: Table) -> Table:
-        """Runs that have the response, under the column of its name."""
+        """Runs with the response, under its name."""
         name, response = self.response, RESPONSES[self.response]
         if response.key not in table or table[response.key].isna().all():
             errors = list(table["error"].dropna()) if "error" in table else []
@@ -95,7 +95,7 @@ class Scale(NamedTuple):
 
 
 def check_truth(entry: "Entry", sequence: "Sequence", names: tuple[str, ...]) -> None:
-    """Check that a recording has the ground truth that the responses need."""
+    """Check a recording's ground truth for responses."""
     for name in names:
         needs, lacking = RESPONSES[name].needs, ""
         if needs in ("truth", "surface") and sequence.ground_truth is None:

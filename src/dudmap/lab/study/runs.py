@@ -1,4 +1,4 @@
-"""The runs of a study: each in a worker process, and its metrics in the study folder as soon as it ends."""
+"""Runs of a study, in worker processes, stored as they end."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 Conduct = Callable[[Sequence[Run]], list[Row]]
 CACHED_BYTES = 300e6
-"""Most bytes of frames of a recording that a worker keeps between runs."""
+"""Bytes of frames that a worker keeps."""
 PIXEL_BYTES = 8
-"""Bytes per pixel of a kept frame: depth, colour and mask."""
+"""Bytes per pixel of a kept frame."""
 
 
 class Job(NamedTuple):
-    """A run, the number of its threads, and the folder that keeps it whole, if any."""
+    """A run, its threads, and its folder, if kept."""
 
     run: Run
     threads: int
@@ -43,11 +43,8 @@ def conduct(
     progress: Callable[[int, int], None] = lambda done, total: None,
     measure: Callable[[Job], Row] | None = None,
 ) -> list[Row]:
-    """Do all runs that have no metrics yet, ``jobs`` at a time; see ``Conduct``.
-
-    ``runs.jsonl`` in ``root`` collects the metrics by key; a failed run has ``error`` instead. With ``keep`` the run
-    folders stay in ``runs/``. ``measure`` replaces the system.
-    """
+    """Do all runs without metrics, ``jobs`` at a time; ``runs.jsonl`` in ``root`` collects metrics by key, or
+    ``error``. ``keep`` leaves run folders in ``runs/``. ``measure`` replaces the system."""
     unique = {run.key: run for run in runs}
     if measure is None and kernel_cache.is_cold():  # once, not in every worker
         for _, step in steps():
@@ -67,7 +64,7 @@ def conduct(
 
 
 def table_of(runs: Sequence[Run], rows: Sequence[Row]) -> Table:
-    """One row per run: number of the point, recording, replicate, values of the factors, metrics or error."""
+    """One row per run: point, recording, replicate, values, metrics or error."""
     import pandas as pd
 
     places = ({"point": run.point, "sequence": run.sequence, "replicate": run.replicate, **run.values} for run in runs)
@@ -77,7 +74,7 @@ def table_of(runs: Sequence[Run], rows: Sequence[Row]) -> Table:
 def measure_run(job: Job) -> Row:
     """Metrics of one run of the system.
 
-    Frames are not prepared ahead in a second thread, so that the time per frame is all the time a frame takes.
+    Frames are not prepared in a second thread, which would hide time.
     """
     import cv2
     from threadpoolctl import threadpool_limits
@@ -94,7 +91,6 @@ def measure_run(job: Job) -> Row:
 
 
 def _reset_peak_memory() -> None:
-    """Reset the peak resident memory (Linux only)."""
     import gc
 
     gc.collect()
@@ -105,7 +101,6 @@ def _reset_peak_memory() -> None:
 
 @lru_cache(maxsize=1)
 def _recording(entry: Entry) -> "Recording":
-    """Recording of a run, read or rendered once for runs that follow each other."""
     sequence = entry.open()
     frames = min(len(sequence), entry.max_frames or len(sequence))
     size = frames * sequence.camera.width * sequence.camera.height * PIXEL_BYTES

@@ -1,7 +1,4 @@
-"""Screening of many keys: all numeric keys as factors, and the effect of each on each recording.
-
-A malformed table, or too few runs for all factors, raises a ``ConfigError``.
-"""
+"""Effect of all numeric keys on each recording. Bad tables, or too few runs, raise a ``ConfigError``."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -16,20 +13,19 @@ if TYPE_CHECKING:
     from dudmap.lab.study.report import Report
 
 FALSE_SHARE = 0.05
-"""Share of the effects called significant that may be due to chance (Benjamini and Hochberg 1995)."""
+"""Share of false discoveries (Benjamini and Hochberg 1995)."""
 MOST_SHOWN = 16
 
 
 def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
-    """Effect of every two-level factor on every recording: mean at its high end minus mean at its low end.
+    """Effect of every two-level factor on every recording, high minus low, by least squares with all factors
+    (statsmodels).
 
-    Least squares with all factors together (statsmodels) per recording. The probabilities are adjusted for the number
-    of keys and recordings together (Benjamini and Hochberg 1995). In a design that is folded over, interactions of two
-    factors are in the residual.
+    Probabilities are adjusted over keys and recordings (Benjamini and Hochberg 1995). Two-factor interactions of a
+    foldover are in the residual.
 
     Returns:
-        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in standard
-            deviations of the residual.
+        Per factor and recording: effect, 95 % interval (low, high), adjusted p, effect in residual standard deviations.
     """
     import pandas as pd
     import statsmodels.api as sm
@@ -57,13 +53,13 @@ def _signs(values: Table) -> Any:  # noqa: ANN401 - an array
 
 
 def strongest(effects: Table) -> list[str]:
-    """Keys with a significant effect on any recording, the largest in standard deviations of the residual first."""
+    """Keys with a significant effect, largest in residual standard deviations first."""
     sure = effects[effects["p"] < FALSE_SHARE]
     return list(sure["relative"].abs().groupby(sure["key"]).max().sort_values(ascending=False).index)
 
 
 def describe_screening(report: "Report", effects: Table, heading: str) -> None:
-    """Add the keys that matter for a response, with their effects per recording."""
+    """Add the keys that matter, with effects per recording."""
     order, count = strongest(effects), effects["key"].nunique()
     report.text(
         f"{len(order)} of {count} keys affect {heading} on at least one recording, from the low to the high end. At "
@@ -81,10 +77,10 @@ def describe_screening(report: "Report", effects: Table, heading: str) -> None:
 
 
 def summary(effects: Mapping[str, Table]) -> str:
-    """Text on the keys that matter for each response.
+    """Text on the keys that matter.
 
     Args:
-        effects: Tables of ``screen`` by the name of the response.
+        effects: Tables of ``screen`` by response.
     """
     if not effects:
         return "No response could be screened."

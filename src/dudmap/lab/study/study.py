@@ -1,7 +1,4 @@
-"""A whole study: its runs, its confirmation, its tables and its report; and chapter 6 of the thesis as studies.
-
-A study that cannot be run raises a ``DudmapError`` before the first run.
-"""
+"""A whole study, and the thesis' chapter 6 as studies. Impossible ones raise a ``DudmapError`` before the first run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -23,7 +20,7 @@ NOTHING = "There is nothing to confirm."
 
 
 def run_study(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS) -> str:
-    """Do all runs, confirm the optimum, and write runs.csv, confirmation.csv and the report; the outcome in words."""
+    """Do all runs, confirm the optimum, write runs.csv, confirmation.csv and report; the outcome in words."""
     from dudmap.lab.study.response_surface import predict_optimum
 
     plan.check(max_runs)
@@ -123,19 +120,19 @@ TABLES: Mapping[str, dict[str, list[Any]]] = {
     "4.2": {"thesis.iterations": [1, 2, 3, 6], "thesis.subsample": ["original", "quarter"]},
     "figure 4.5": {"thesis.similarity": [0.6, 0.7, 0.75, 0.8, 0.84, 0.9, 1.0]},
 }  # fmt: skip
-"""Factors and levels of tables and figures of the thesis: 4.1, 4.2, 6.3, figures 4.5 and 4.6. Table 6.1 serves
-figures 6.1, 6.2 and 6.4; table 6.2 figure 6.3. The band is fixed in metres: the voxel size varies alone."""
+"""Factors and levels of the thesis' tables 4.1, 4.2, 6.1 (figures 6.1, 6.2, 6.4), 6.2 (6.3), 6.3, figures 4.5 and 4.6;
+the band is fixed in metres."""
 ROOM: dict[str, Any] = {
     "name": "room", "scene": "room", "movers": ["person"], "frames": 240, "camera": [320, 240],
 }  # fmt: skip
-"""Recording of a study without any: a room with a walking person. The thesis took freiburg3_walking_xyz for tables
-6.1 and 6.2 and freiburg3_walking_static for table 6.3."""
+"""Default recording: a room with a walking person. The thesis took freiburg3_walking_xyz (6.1, 6.2) and
+freiburg3_walking_static (6.3)."""
 PUBLISHED_CONFIRMATION = 89.0
-"""ATE that the thesis measured at its quadratic optimum, millimetres (section 6.1)."""
+"""ATE at the thesis' quadratic optimum, millimetres (section 6.1)."""
 
 
 def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int | None = None) -> Plan:
-    """Plan of one of the ``TABLES`` of the thesis, on ``ROOM`` unless recordings are named."""
+    """Plan of one of ``TABLES``, on ``ROOM`` by default."""
     some = {} if frames is None else {"frames": frames}
     return make_plan(
         {
@@ -148,7 +145,7 @@ def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int
 
 
 def published_table() -> Table:
-    """The 81 values of table 6.1 as runs: ATE RMSE in metres on freiburg3_walking_xyz."""
+    """The 81 values of table 6.1: ATE RMSE in metres, freiburg3_walking_xyz."""
     import pandas as pd
 
     with (files("dudmap.lab.study") / "thesis_table_6_1.csv").open(encoding="utf-8") as file:
@@ -160,9 +157,9 @@ def published_table() -> Table:
 
 
 def published_report(out: Path) -> str:
-    """Analyse the values of table 6.1 as the thesis printed them; write the report and return the outcome.
+    """Analyse the printed table 6.1; write the report and return the outcome.
 
-    The confirmation is the thesis' own: 0.089 m at its optimum, 0.080 m at the best point of the design.
+    Confirmed by the thesis: 0.089 m at its optimum, 0.080 m at the best design point.
     """
     from dudmap.lab.study.response_surface import confirm, predict_optimum
 

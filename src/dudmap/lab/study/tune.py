@@ -1,10 +1,9 @@
-"""Search for a configuration on training recordings, and judge it on other recordings.
+"""Search for a configuration on training recordings, judged on others.
 
-Optuna proposes configurations (multi-objective TPE; Ozaki et al. 2022). Metrics are ratios to the base configuration on
-the same recording, so that recordings count equally. Results are kept and proposals depend only on them and the seed,
-so that a stopped search continues.
+Optuna proposes (multi-objective TPE; Ozaki et al. 2022). Metrics are ratios to the base configuration on the same
+recording. Proposals depend on results and seed only, so that a search continues.
 
-A search that cannot be judged raises a ``DudmapError`` before the first run.
+A search without judges raises a ``DudmapError`` before the first run.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,22 +27,22 @@ if TYPE_CHECKING:
 
 Numbers = NDArray[np.float64]
 Measure = Callable[[Sequence[Point], Plan], list[Numbers | None]]
-"""Ratios (recordings, responses) to the base configuration of each point; None if a run failed."""
+"""Ratios (recordings, responses) to the base configuration per point; None if a run failed."""
 
 RATIOS = ("ate", "rpe", "mesh_accuracy", "ms", "memory")
-"""Positive responses, whose ratio to the base configuration is meaningful."""
+"""Positive responses."""
 SIGNIFICANT = 0.05
-"""Largest p of a recommendation: one-sided t test of log ratios on the second set, corrected after Holm."""
+"""Largest p of a recommendation: one-sided t test of log ratios on the second set (Holm)."""
 FEWEST_JUDGES = 3
-"""Fewest recordings of the second set; a t test of two ratios finds hardly anything."""
+"""Fewest recordings of the second set for a t test."""
 BATCH = 4
-"""Configurations proposed at a time, independent of the number of workers."""
+"""Configurations proposed at a time."""
 MOST_JUDGED = 5
-"""Most configurations of the training front that are judged; each weakens all tests."""
+"""Judged configurations; each weakens all tests."""
 
 
 def check_tune(plan: Plan, max_runs: int = MAX_RUNS) -> None:
-    """Check everything that can be known before the first run."""
+    """Check everything known before the first run."""
     for name in plan.responses:
         if name not in RATIOS:
             raise ConfigError(f"tune cannot use the response {name}, which can be 0; it knows {', '.join(RATIOS)}")
@@ -67,7 +66,7 @@ def _identity(entry: Entry) -> str:
 def ratios(points: Sequence[Point], plan: Plan, conduct: Conduct) -> list[Numbers | None]:
     """Ratios (recordings, responses) to the base configuration; None for a point with a failed run.
 
-    A point that loses more frames than the base configuration on any recording counts as failed.
+    A point that loses more frames on any recording has failed.
     """
     runs = [plan.runs_at(number, point) for number, point in enumerate([{}, *points])]
     rows = conduct([run for same in runs for run in same])
@@ -86,7 +85,7 @@ def ratios(points: Sequence[Point], plan: Plan, conduct: Conduct) -> list[Number
 
 
 def training_front(plan: Plan, measure: Measure) -> list[tuple[Point, tuple[float, ...]]]:
-    """Configurations of the training front, best first response first, with their mean ratios."""
+    """The training front with mean ratios, best first response first."""
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -111,9 +110,9 @@ def judged(plan: Plan, measure: Measure) -> list[tuple[Point, dict[str, Any]]]:
     """Search, and judge the training front on the second set.
 
     Returns:
-        Values of the factors, and a row of the table with these values. Per response and set, the row has the geometric
-        mean ratio to the base configuration (NaN if a run failed or lost more frames). It also has the probability p of
-        the first response's ratios without an improvement, and whether the improvement holds.
+        Values of the factors, and a row: per response and set the geometric mean ratio (NaN if failed), p of the first
+            response without improvement, and whether it holds.
+        Probability of ratios (recordings,) at most as large, if their logarithms had mean 0 (t test).
     """
     from statsmodels.stats.multitest import multipletests
 
@@ -163,7 +162,7 @@ def suggest(trial: "optuna.trial.Trial", factors: Sequence[Factor]) -> Point:
 
 
 def run_tune(plan: Plan, out: Path, conduct: Conduct, max_runs: int = MAX_RUNS) -> str:
-    """Search, judge, and write tune.csv, and recommended.toml if a configuration holds; return the outcome in words."""
+    """Search, judge, write tune.csv, and recommended.toml if one holds; the outcome in words."""
     import pandas as pd
 
     check_tune(plan, max_runs)

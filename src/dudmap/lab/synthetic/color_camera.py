@@ -1,4 +1,4 @@
-"""Colour camera of a synthetic sensor (place, time, lens, exposure), and systematic errors of its depth."""
+"""Colour camera of a synthetic sensor, and systematic errors of its depth."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,17 +15,17 @@ from dudmap.lab.synthetic.faults import SensorFaults
 
 Image = NDArray[np.float32]
 TARGET_LEVEL = 110.0
-"""Mean grey value targeted by the automatic exposure; assumed, a little below the middle of the scale."""
+"""Mean grey value of automatic exposure; assumed."""
 LARGEST_GAIN = 4.0
-"""Range of the exposure, as a factor up and down: two stops, assumed."""
+"""Range of the exposure, factor up and down: assumed."""
 WHITE_BALANCE_PERIOD = 8.0
-"""Period of the drift of the white balance, seconds; assumed."""
+"""Period of white balance drift, seconds; assumed."""
 
 
 class ColorCamera:
-    """Colour camera that accompanies a depth camera, with true intrinsics ``camera``.
+    """Colour camera beside a depth camera, with true intrinsics ``camera``.
 
-    The exposure of a row takes ``exposure_time`` (0: no motion blur); times in seconds.
+    A row is exposed for ``exposure_time`` (0: no blur), seconds.
     """
 
     def __init__(self, faults: SensorFaults, depth_camera: Camera, exposure_time: float, frame_interval: float) -> None:
@@ -37,11 +37,11 @@ class ColorCamera:
         self._step = exposure_time / count
 
     def view(self, t: float, render: Callable[[float, Camera], Image]) -> Image:
-        """Light on the sensor (H, W, 3), 0..255, in the frame stamped ``t``.
+        """Light on the sensor (H, W, 3), 0..255, in the frame at ``t``.
 
         Args:
             t: Seconds.
-            render: Image of an ideal camera, at the place of this one, at a time in seconds.
+            render: Ideal image at a time in seconds.
         """
         margin = self._lens.margin if self.camera.distortion else 0
         height, width = self.camera.height + 2 * margin, self.camera.width + 2 * margin
@@ -59,7 +59,7 @@ class ColorCamera:
         return self._lens.distort(color) if margin else color
 
     def exposed(self, color: Image, t: float, gain: float) -> Image:
-        """Image (H, W, 3) after exposure by the factor ``gain``, white balance at time ``t``, and vignetting."""
+        """Image (H, W, 3) after exposure ``gain``, white balance at ``t``, vignetting."""
         if self._faults.auto_exposure:
             color = color * np.float32(gain)
         if self._faults.white_balance_drift:
@@ -74,7 +74,6 @@ class ColorCamera:
 
     @cached_property
     def _vignette(self) -> Image:
-        """Brightness (H, W, 1) relative to the middle: 1 - vignetting (r / r_corner)^2."""
         v, u = (np.asarray(axis) for axis in np.indices(self.camera.shape, dtype=np.float32))
         middle_u, middle_v = (self.camera.width - 1) / 2, (self.camera.height - 1) / 2
         squared = ((u - middle_u) ** 2 + (v - middle_v) ** 2) / (middle_u**2 + middle_v**2)
@@ -84,8 +83,8 @@ class ColorCamera:
 def exposure_gains(levels: NDArray[np.float64], times: NDArray[np.float64], lag: float) -> NDArray[np.float64]:
     """Factors (N,) of an automatic exposure with a lag in seconds, from mean grey values (N,) at factor 1.
 
-    It is a first-order control loop on the logarithm of the exposure. Each frame moves by 1 - exp(-dt / lag) towards
-    the factor that would have brought the previous frame to ``TARGET_LEVEL``. The first frame is settled.
+    Each frame moves by 1 - exp(-dt / lag), in the logarithm, towards ``TARGET_LEVEL`` for the previous frame; the first
+    is settled.
     """
     wanted = np.clip(np.log(TARGET_LEVEL / np.maximum(levels, 1.0)), -np.log(LARGEST_GAIN), np.log(LARGEST_GAIN))
     gains = np.empty(len(times))
@@ -102,7 +101,7 @@ def white_balance(faults: SensorFaults, t: float) -> NDArray[np.float32]:
 
 
 class Lens:
-    """Lens that distorts an ideal image of a view that is larger by ``margin`` pixels on every side."""
+    """Lens on an ideal image with ``margin`` more pixels on every side."""
 
     def __init__(self, camera: Camera) -> None:
         rows, columns = np.indices(camera.shape, dtype=np.float64)
@@ -113,12 +112,12 @@ class Lens:
         self._at = (ideal + self.margin).astype(np.float32)
 
     def distort(self, wide: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Distorted image (H, W, 3) of the ideal one (H + 2 margin, W + 2 margin, 3)."""
+        """Distorted image (H, W, 3) of an ideal one (H + 2 margin, W + 2 margin, 3)."""
         return np.asarray(cv2.remap(wide, self._at, np.empty(0), cv2.INTER_CUBIC), dtype=np.float32)
 
 
 def compressed(color: NDArray[np.uint8], quality: float) -> NDArray[np.uint8]:
-    """Image (H, W, 3) after JPEG compression and decompression."""
+    """Image (H, W, 3) after JPEG."""
     done, code = cv2.imencode(".jpg", color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, round(quality)])
     if not done:
         raise FrameError("the colour image could not be compressed as JPEG")
@@ -128,15 +127,15 @@ def compressed(color: NDArray[np.uint8], quality: float) -> NDArray[np.uint8]:
 
 
 BANDS = 8
-"""Number of vertical bands over the width of the image, assumed."""
+"""Vertical bands, assumed."""
 MODES = 6
-"""Number of waves of the smooth distortion."""
+"""Waves of the smooth distortion."""
 EDGE = (0.04, 0.02)
-"""A neighbour is beyond a depth edge if it differs by more than EDGE[0] z + EDGE[1], metres."""
+"""Depth edge: difference above EDGE[0] z + EDGE[1], metres."""
 
 
 class DepthFaults:
-    """Systematic depth errors of one sensor, with patterns drawn from a seed."""
+    """Systematic depth errors of one sensor, by seed."""
 
     def __init__(self, faults: SensorFaults, camera: Camera, seed: int) -> None:
         self._faults, self._camera, self._seed = faults, camera, seed
@@ -167,7 +166,7 @@ class DepthFaults:
         }
 
     def multiplier(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Any]) -> NDArray[np.float64]:
-        """Factor of scale error and smooth distortion at pixels u, v and true depths z in metres (matching arrays)."""
+        """Factor of scale error and distortion at pixels u, v and depths z, metres."""
         total = np.zeros(np.broadcast(u, v, z).shape)
         if self._faults.depth_distortion:
             width, height = self._camera.width, self._camera.height
@@ -176,7 +175,7 @@ class DepthFaults:
         return 1.0 + self._faults.depth_scale_error + 0.5 * z * total
 
     def apply(self, exact: NDArray[np.float32], index: int) -> NDArray[np.float32]:
-        """Noise-free depth measurement (H, W) of true depth, metres; 0 stays 0."""
+        """Noise-free measurement (H, W) of true depth, metres; 0 stays 0."""
         faults, depth = self._faults, exact
         if faults.flying_pixels:
             depth = with_flying_pixels(depth, faults.flying_pixels, np.random.default_rng([self._seed, 7, index]))
@@ -189,7 +188,7 @@ class DepthFaults:
 
 
 def with_flying_pixels(depth: NDArray[np.float32], share: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Depth (H, W) in which ``share`` of the pixels at a depth edge lie between the two surfaces."""
+    """Depth (H, W) with ``share`` of edge pixels between both surfaces."""
     valid = np.where(depth > 0, depth, np.nan)
     padded = np.pad(valid, 1, constant_values=np.nan)
     around = np.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])

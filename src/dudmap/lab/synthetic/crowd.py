@@ -1,7 +1,4 @@
-"""Stream of walking people that covers a given share of the image.
-
-A share that no crowd covers raises a ``ConfigError``.
-"""
+"""Stream of people that covers a share of the image; impossible shares raise a ``ConfigError``."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +11,15 @@ from dudmap.lab.synthetic.render import Renderer
 from dudmap.lab.synthetic.scene import pose
 
 ENTRY_SPEED = 3.0
-"""Speed at which a slow crowd enters the view, m/s."""
+"""Speed at which a slow crowd enters, m/s."""
 
 
 class Crowd:
-    """People walking in a line across the view, who re-enter it on the other side.
+    """People walking in a line across the view, who re-enter on the other side.
 
     Args:
-        staging: Scene, random numbers, speed, duration, and whether the crowd is in view in the first frame.
-        density: From 0 (few people far away) to 1 (a closed line directly in front of the camera).
+        staging: Scene, random numbers, speed, duration, start.
+        density: 0 (few, far away) to 1 (a closed line before the camera).
     """
 
     def __init__(self, staging: Staging, density: float) -> None:
@@ -45,7 +42,7 @@ class Crowd:
         self.figures = [Figure(rng, number, size, stride) for number in range(min(self.count, 5))]
 
     def advanced(self, t: float) -> float:
-        """Distance in metres that everybody has walked at time ``t``; without ``start_dynamic`` it starts at 0.5 s."""
+        """Distance walked at ``t``, metres; from 0.5 s without ``start_dynamic``."""
         if t <= self.steady_from and not self.staging.start_dynamic:
             return self.hurry * (t - 0.5)
         return self.lane + self.speed * (t - self.steady_from)
@@ -74,7 +71,6 @@ class Crowd:
 
 
 def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]) -> float:
-    """Mean share of the image that the crowd covers in frames at ``times`` (N,) with poses (N, 4, 4)."""
     scene, movers = crowd.staging.scene, crowd.movers()
     camera = Camera(66.0, 66.0, 39.5, 29.5, 80, 60)
     renderer = Renderer(scene, scene.primitives + [p for mover in movers for p in mover.primitives])
@@ -88,10 +84,8 @@ def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray
 def crowd_of(
     coverage: float, staging: Staging, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]
 ) -> Crowd:
-    """Crowd that covers the share ``coverage`` of the image on average, once all of it is in view; by bisection.
-
-    The frames have timestamps (N,) in seconds and camera poses (N, 4, 4).
-    """
+    """Crowd that covers ``coverage`` of the image on average, by bisection, in frames at (N,) seconds with poses (N, 4,
+    4)."""
     if not 0.02 <= coverage <= 0.95:
         raise ConfigError(f"coverage is {coverage}; expected a share of the image from 0.02 to 0.95")
     seed = int(staging.rng.integers(2**32))

@@ -14,8 +14,8 @@ from dudmap.errors import ConfigError
 from dudmap.lab.data import find
 
 BAND_ROWS, MOST_BANDS = 16, 24
-"""Rows per band of a rolling shutter image (at least), and bands (at most), each rendered at one time. The time of a
-row errs by at most 1/30 of the readout at 240 rows, 1/48 from 384 rows."""
+"""Rows per rolling-shutter band (least), and bands (most). A row's time errs by 1/30 of the readout at 240 rows, 1/48
+from 384."""
 
 
 def _fault(usual: Any, low: float, high: float) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
@@ -24,38 +24,34 @@ def _fault(usual: Any, low: float, high: float) -> Any:  # noqa: ANN401 - a numb
 
 @dataclass(frozen=True)
 class SensorFaults:
-    """Errors of a real sensor that its files do not state; by default none.
+    """Errors of a real sensor that its files do not state; none by default.
 
         Depth is taken by the recording's camera at the time stamp. Colour is taken by a separate camera with the same
         image size. The files present it as registered to the depth and taken at the same time.
 
     Attributes:
-        color_translation: Position of the colour camera in the frame of the depth camera, metres.
-        color_rotation_deg: Rotation vector (axis times angle) of the colour camera in that frame, degrees.
-        color_focal_ratio: Focal lengths of the colour camera over the depth camera's.
-        color_center_shift: Principal point of the colour camera minus the depth camera's (u, v), pixels.
-        color_delay: Time from the stamp to the exposure of the middle of the colour image, seconds.
-        color_readout: Time from the first to the last row of the colour image (rolling shutter), seconds. Row v of H is
-            exposed at stamp + color_delay + color_readout ((v + 1/2) / H - 1/2). Negative: the last row is first.
-        color_distortion: Lens distortion left in the colour image: k1, k2, p1, p2 of the Brown-Conrady model (thesis
-            eq. 3.88) with the intrinsics of the colour camera.
-        auto_exposure: Time constant in seconds of an exposure that follows the mean brightness of the previous frame; 0
-            for a fixed exposure.
-        white_balance_drift: Relative amplitude of a slow oscillation of red against blue.
-        vignetting: Share of the brightness lost in the image corners, in addition to the small loss of every recording.
-        jpeg_quality: Quality 1 to 100 of the JPEG compression of the colour; 0 for none.
+        color_translation: Colour camera in the depth camera's frame, metres.
+        color_rotation_deg: Its rotation vector, degrees.
+        color_focal_ratio: Focal lengths, colour over depth.
+        color_center_shift: Principal point, colour minus depth (u, v), pixels.
+        color_delay: Stamp to exposure of the middle row, seconds.
+        color_readout: First to last row, seconds: row v of H is exposed at stamp + color_delay + color_readout ((v +
+            1/2) / H - 1/2).
+        color_distortion: k1, k2, p1, p2 left in the colour image (Brown-Conrady, thesis eq. 3.88).
+        auto_exposure: Time constant, seconds, of an exposure that follows brightness; 0 for a fixed one.
+        white_balance_drift: Relative amplitude of red against blue.
+        vignetting: Brightness lost in the corners, in addition to every recording's.
+        jpeg_quality: 1 to 100; 0 for none.
         depth_scale_error: Relative error of all depths.
-        depth_offset: Constant added to all depths, metres.
-        depth_bands: Root mean square depth error at 1 m of vertical bands of constant disparity error, metres, as in a
-            cold sensor; it grows with z^2.
-        depth_distortion: Root mean square relative depth error at 2 m of a smooth pattern that changes with the range
-            and grows with z.
-        flying_pixels: Share of the pixels at a depth edge with a depth between both surfaces.
-        dropped_frames: Share of the frames that are missing.
-        late_frames: Share of the frames taken late, by 10 to 60 % of the frame interval, with correct stamps.
+        depth_offset: Added to all depths, metres.
+        depth_bands: Root mean square depth error at 1 m of vertical disparity bands, metres; grows with z^2.
+        depth_distortion: Root mean square relative depth error at 2 m of a smooth pattern; grows with z.
+        flying_pixels: Share of edge pixels between both surfaces.
+        dropped_frames: Share of missing frames.
+        late_frames: Share taken late, by 10 to 60 % of the interval, with correct stamps.
 
     Raises:
-        ConfigError: A value is outside ``LIMITS`` or has the wrong number of elements.
+        ConfigError: A value outside ``LIMITS`` or of wrong length.
     """
 
     color_translation: tuple[float, float, float] = _fault((0.0, 0.0, 0.0), -1.0, 1.0)
@@ -88,14 +84,14 @@ class SensorFaults:
 
     @property
     def T_depth_color(self) -> NDArray[np.float64]:
-        """(4, 4) pose of the colour camera in the frame of the depth camera."""
+        """(4, 4) pose of the colour camera in the depth camera's frame."""
         T = np.eye(4)
         T[:3, :3] = se3.exp_rotation(np.radians(self.color_rotation_deg))
         T[:3, 3] = self.color_translation
         return T
 
     def color_camera(self, camera: Camera) -> Camera:
-        """Intrinsics of the colour camera that accompanies the depth camera ``camera``."""
+        """Intrinsics of the colour camera beside ``camera``."""
         return replace(
             camera,
             fx=camera.fx * self.color_focal_ratio,
@@ -113,10 +109,10 @@ class SensorFaults:
         return any(np.any(np.not_equal(getattr(self, name), getattr(without, name))) for name in names)
 
     def row_bands(self, height: int, margin: int = 0, step: float = 0.0) -> list[tuple[int, int, float]]:
-        """Bands of rows rendered at one time: first row, row after the last, and time relative to the stamp, s.
+        """Bands rendered at one time: first row, row after the last, time relative to the stamp, s.
 
-        Rows count from 0 at the upper image edge; ``margin`` rows are added above and below. Times of bands differ by
-        at least ``step`` seconds, the resolution of a blurred exposure.
+        ``margin`` rows are added above and below; rows count from the image edge. Times differ by at least ``step``
+        seconds.
         """
         count = max(min(MOST_BANDS, height // BAND_ROWS), 1) if self.color_readout else 1
         if step > 0:
@@ -127,7 +123,7 @@ class SensorFaults:
         return [(int(a), int(b), float(times[a:b].mean())) for a, b in pairwise(edges)]
 
     def frame_times(self, frames: int, fps: float, seed: int) -> NDArray[np.float64]:
-        """Stamps (N,) in seconds of the frames that arrive out of ``frames``; the first always arrives, at 0."""
+        """Stamps (N,) in seconds of the arriving frames; the first always arrives, at 0."""
         times = np.arange(frames) / fps
         if not self.dropped_frames and not self.late_frames:
             return np.round(times, 6)
@@ -139,7 +135,7 @@ class SensorFaults:
         return np.round(times[arrives], 6)
 
     def truth(self, camera: Camera) -> dict[str, Any]:
-        """Ground truth for the recording's folder: the faults, and the resulting colour camera."""
+        """Ground truth for the folder: faults, and colour camera."""
         return {
             "faults": asdict(self),
             "depth_camera": asdict(camera),
@@ -149,11 +145,11 @@ class SensorFaults:
 
 
 LIMITS: dict[str, tuple[float, float]] = {fault.name: fault.metadata["limits"] for fault in fields(SensorFaults)}
-"""Smallest and largest accepted value of every fault."""
+"""Smallest and largest value of every fault."""
 
 
 def parse_faults(assignments: Sequence[str]) -> dict[str, Any]:
-    """Faults of ``NAME=VALUE`` pairs by name; several numbers are comma-separated.
+    """Faults by name from ``NAME=VALUE``, with comma-separated numbers.
 
     Raises:
         ConfigError: A pair cannot be understood.

@@ -1,4 +1,4 @@
-"""Writer of synthetic recordings in the layout of the TUM RGB-D benchmark, with the ground truth."""
+"""Writer of synthetic recordings in TUM layout with ground truth."""
 
 import json
 from collections.abc import Callable
@@ -25,21 +25,18 @@ def write_folder(
     surface: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
-    """Render all frames into a folder, which is created if needed.
-
-    The folder receives:
+    """Render all frames into a folder:
 
     - rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre) and masks/ (255 = dynamic).
     - rgb.txt, depth.txt, mask.txt, associations.txt, groundtruth.txt and intrinsics.txt.
     - coverage.txt (dynamic share of the image) and movers.jsonl.
-    - scene.json and sensor_truth.json (the faults of the sensor).
     - surface.ply (the static surface) and surface_observed.ply (the part that the camera saw).
 
-    If writing is interrupted, the lists contain the complete frames. ``overwrite`` accepts a folder that is not empty.
-    ``progress`` is called with the number of finished frames.
+    If interrupted, the lists contain the complete frames. ``overwrite`` accepts a folder with content; ``progress``
+    receives finished frames.
 
     Raises:
-        DatasetError: The folder is not empty, or cannot be written.
+        DatasetError: The folder has content, or cannot be written.
     """
     out = Path(out)
     try:

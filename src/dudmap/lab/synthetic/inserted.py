@@ -14,11 +14,11 @@ from dudmap.lab.synthetic.sensors import Sensor
 
 
 class WithThing:
-    """Some frames of a recording, with solids inserted unless nearer depth hides them; missing depth does not hide.
+    """Frames of a recording with inserted solids, hidden by nearer depth only.
 
     Args:
-        trajectory: Camera poses in the world of the solids; frames without a pose stay unchanged.
-        solids: The thing; without any the frames stay unchanged.
+        trajectory: Poses in the solids' world; others stay unchanged.
+        solids: The thing, or none.
     """
 
     def __init__(self, recording: Sequence, frames: range, trajectory: Trajectory, solids: list[Primitive]) -> None:
@@ -36,7 +36,7 @@ class WithThing:
             solids,
         )  # fmt: skip
         self.seen: list[NDArray[np.float64]] = []
-        """Points (n, 3) of the thing visible in each frame read so far, metres, world of the solids."""
+        """Visible points (n, 3) of the thing in each read frame, metres, solids' world."""
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -1,4 +1,4 @@
-"""Motion: smooth paths over the floor, and the articulated model of a walking person."""
+"""Smooth paths over the floor, and a walking person."""
 
 from collections.abc import Sequence
 
@@ -13,20 +13,19 @@ STEP = 0.01
 
 
 def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-    """Gaussian smoothing along axis 0 of samples ``STEP`` apart, with constant continuation at the ends."""
+    """Gaussian smoothing along axis 0 of samples ``STEP`` apart."""
     from scipy.ndimage import gaussian_filter1d
 
     return gaussian_filter1d(values, seconds / STEP, axis=0, mode="nearest", truncate=3.0)
 
 
 class FloorPath:
-    """Path over the floor through points (K, 2) in metres at given times (K,) in seconds, with rounded corners.
-
-    It starts and stops gradually, and rests before the first time and after the last.
+    """Path over the floor through points (K, 2), metres, at times (K,), seconds, with rounded corners and rests at both
+    ends.
 
     Args:
         smooth: Standard deviation of the smoothing, seconds.
-        gaps: Intervals (from, to) in which the object is absent, seconds.
+        gaps: Intervals (from, to) of absence, seconds.
     """
 
     def __init__(
@@ -59,13 +58,13 @@ class FloorPath:
         self.yaws = smoothed(np.unwrap(np.append(filled, filled[-1:]))[:, None], 0.12)[:, 0]
 
     def at(self, t: float) -> tuple[NDArray[np.float64], float, float]:
-        """Position (2,) in metres, heading in radians and covered distance in metres at time ``t``."""
+        """Position (2,) in metres, heading in radians and distance in metres at ``t``."""
         columns = (self.positions[:, 0], self.positions[:, 1], self.yaws, self.walked)
         x, y, yaw, walked = (float(np.interp(t, self.stamps, column)) for column in columns)
         return np.array([x, y]), yaw, walked
 
     def pose(self, t: float, height: float) -> NDArray[np.float64]:
-        """Pose (4, 4) of an object at a height in metres that faces along the path, at time ``t``."""
+        """Pose (4, 4) of an object at a height in metres, facing along the path."""
         position, yaw, _ = self.at(t)
         return pose((*position, height), float(np.degrees(yaw)))
 
@@ -83,11 +82,10 @@ def crossing(
     start_inside: bool = False,
     entry_speed: float = 1.2,
 ) -> FloorPath:
-    """Path from one end of ``line`` to the other and, after a second out of view, back again, until ``duration``.
+    """Path along ``line`` and, after a second out of view, back, until ``duration``.
 
-    The speed is ``speed`` on the middle 40 % of the line and ``max(speed, entry_speed)`` elsewhere, so that slow movers
-    also come into view. The first 25 % are passed at the time ``enter`` in seconds. With ``start_inside`` the path
-    begins in the middle of the view.
+    The speed is ``speed`` on the middle 40 %, else ``max(speed, entry_speed)``. 25 % are passed at ``enter`` seconds;
+    ``start_inside`` begins in the middle.
     """
     a, b = np.asarray(line[0], float), np.asarray(line[1], float)
     length = float(np.linalg.norm(b - a))
@@ -111,7 +109,7 @@ def crossing(
 
 
 def smooth_step(share: float) -> float:
-    """Cubic step: 0 below 0, 1 above 1, with zero slope at both ends."""
+    """Cubic step from 0 to 1 with zero end slopes."""
     x = min(max(share, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
 
@@ -131,10 +129,10 @@ OUTFITS = (
 
 
 class Figure:
-    """Person 1.72 m tall times ``size``, facing +x and standing on z = 0.
+    """Person 1.72 m times ``size``, facing +x, standing on z = 0.
 
     Attributes:
-        limbs: (P,) number of the limb of each solid.
+        limbs: (P,) limb of each solid.
     """
 
     def __init__(self, rng: np.random.Generator, outfit: int, size: float = 1.0, stride: float = 1.35) -> None:

@@ -15,18 +15,18 @@ from dudmap.lab.synthetic.scene import Material, Primitive, Scene, pose
 
 Matrix = NDArray[np.float64]
 MOVING_SPEED = 0.01
-"""Speed below which an object is at rest, m/s."""
+"""Speed of rest, m/s."""
 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticMover:
-    """A moving object; all limbs of a person are one mover.
+    """A moving object with all limbs.
 
     Attributes:
         name: Kind of object.
         primitives: Its solids, each in the frame of its part.
-        parts: T_world_part (P, 4, 4) of every solid as a function of time.
-        reference: T_world_mover (4, 4) as a function of time; its origin defines the velocity of the mover.
+        parts: T_world_part (P, 4, 4) of every solid at a time.
+        reference: T_world_mover (4, 4) at a time; its origin has the mover's velocity.
     """
 
     name: str
@@ -37,12 +37,12 @@ class SyntheticMover:
     settles: bool = True
 
     def velocity(self, t: float) -> Matrix:
-        """Velocity (3,) of the origin of the reference frame, m/s, world frame."""
+        """Velocity (3,) of the reference origin, m/s, world frame."""
         h = 0.005
         return (self.reference(t + h)[:3, 3] - self.reference(t - h)[:3, 3]) / (2 * h)
 
     def top_speed(self, t: float, span: float) -> float:
-        """Largest mean speed of any bounding-box corner of the solids over ``span`` seconds around ``t``, m/s."""
+        """Largest mean speed of a bounding-box corner over ``span`` seconds around ``t``, m/s."""
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(1, 8, 3)
         bounds = np.array([p.bounds() for p in self.primitives])[:, None, :] * corners
         local = np.array([p.T_body_primitive for p in self.primitives])
@@ -54,7 +54,7 @@ class SyntheticMover:
 
 
 def placed(movers: list[SyntheticMover], t: float) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Poses (P, 4, 4) of all solids of movers at a time in seconds, and which of them exist then (P,)."""
+    """Poses (P, 4, 4) of all solids at a time, and which exist (P,)."""
     Ts, present = [np.empty((0, 4, 4))], []
     for mover in movers:
         count, exists = len(mover.primitives), mover.present(t)
@@ -69,9 +69,9 @@ class Staging:
     """Conditions under which movers are built.
 
     Attributes:
-        speed: Requested speed, m/s; None for the natural speed of each mover.
-        duration: Duration of the recording, seconds.
-        start_dynamic: Whether they are in view and moving in the first frame.
+        speed: m/s; None for natural speeds.
+        duration: Seconds.
+        start_dynamic: In view and moving in the first frame.
     """
 
     scene: Scene
@@ -81,11 +81,11 @@ class Staging:
     start_dynamic: bool
 
     def pace(self, natural: float) -> float:
-        """Requested speed, else ``natural`` (m/s at life size) scaled to the scene."""
+        """Requested speed, else ``natural`` (m/s at life size) scaled."""
         return self.speed if self.speed is not None else natural * self.scene.mover_scale
 
     def crossing(self, speed: float, entry_speed: float) -> FloorPath:
-        """Path along the walk line of the scene, m/s in the middle of the view and at its ends."""
+        """Path along the scene's walk line, m/s in the middle and at the ends."""
         line, inside = self.scene.walk_line, self.start_dynamic
         return crossing(line, speed, self.duration, start_inside=inside, entry_speed=entry_speed)
 
@@ -93,7 +93,7 @@ class Staging:
 def person_on(
     path: FloorPath, figure: Figure, ground: float, carrying: Callable[[float], float] = lambda _: 0.0
 ) -> SyntheticMover:
-    """Person walking along a path; ``carrying`` is a function of time for the lift of the arms in [0, 1]."""
+    """Person walking along a path; ``carrying``: lift of the arms in [0, 1] at a time."""
 
     def reference(t: float) -> Matrix:
         return path.pose(t, ground)
@@ -122,7 +122,6 @@ def _figure(staging: Staging, outfit: int, speed: float) -> Figure:
 
 
 def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> SyntheticMover:
-    """Person on the walk line of the scene, shifted to its left (m), possibly reversed."""
     scene, speed, size = staging.scene, staging.pace(1.2), staging.scene.mover_scale
     a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
     aside = shift * size * (np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a))
@@ -229,7 +228,6 @@ def _cart(path: FloorPath, scene: Scene, name: str) -> list[SyntheticMover]:
 
 
 def _creeper(staging: Staging) -> list[SyntheticMover]:
-    """Cart that enters quickly and then crosses the view at 5 cm/s."""
     speed = staging.pace(0.05)
     path = staging.crossing(speed, max(speed, staging.scene.mover_scale))
     return _cart(path, staging.scene, "creeper")
@@ -257,7 +255,6 @@ def _starting(staging: Staging) -> list[SyntheticMover]:
 
 
 def _door(staging: Staging) -> list[SyntheticMover]:
-    """Door leaf that opens, rests and closes again."""
     scene, size = staging.scene, staging.scene.mover_scale
     angle = np.radians(95.0)
     swing = angle * 0.8 * size / staging.pace(0.5)

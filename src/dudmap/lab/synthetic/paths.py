@@ -1,7 +1,4 @@
-"""Camera paths: built-in ones, and recorded trajectories placed in a scene by a rigid motion.
-
-A path that is unknown, or does not fit the scene, raises a ``ConfigError``.
-"""
+"""Camera paths: built-in, or recorded and placed in a scene. Unknown or unfit ones raise a ``ConfigError``."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -20,8 +17,6 @@ Array = NDArray[np.float64]
 
 
 def _wander(rng: np.random.Generator, times: Array, speed: float, quick: float = 1.0) -> Array:
-    """Smooth random motion (N, 3): slow sines per axis, mean ``speed`` units per second; ``quick`` multiplies the
-    frequencies."""
     dense = np.arange(0.0, 30.0, 0.02)
     frequency = quick * rng.uniform([0.08, 0.18, 0.3], [0.16, 0.28, 0.45], (3, 3))
     phase = rng.uniform(0, 2 * np.pi, (3, 3))
@@ -54,7 +49,6 @@ def _shaken(Ts: Array, rotations: Array) -> Array:
 
 
 def _within(scene: Scene, shift: Array) -> Array:
-    """Shifts (N, 3) from the home position, limited to the free space of the scene by tanh."""
     low, high = (np.asarray(corner) - scene.home[:3, 3] for corner in scene.space)
     return np.where(shift > 0, high * np.tanh(shift / high), low * np.tanh(shift / low))
 
@@ -68,7 +62,7 @@ def handheld(
     tremor: float = 1.0,
     quick: float = 1.0,
 ) -> Array:
-    """Hand-held camera aimed at the target: mean speed in m/s (at life size), mean rotation rate in degrees/s."""
+    """Hand-held camera aimed at the target: m/s (at life size), degrees/s."""
     shift = _within(scene, _wander(rng, times, speed * max(scene.mover_scale, 0.3), quick))
     shift += _tremor(rng, times, 0.0005 * tremor * scene.mover_scale)
     Ts = _aimed(scene.home[:3, 3] + shift, np.asarray(scene.target))
@@ -85,13 +79,11 @@ def _turned(offset: Array, angle: Array) -> Array:
 
 
 def _at_target(scene: Scene, rng: np.random.Generator, times: Array, eyes: Array, tremor_deg: float = 0.04) -> Array:
-    """Poses at eyes (N, 3) aimed at the target, with hand tremor."""
     Ts = _aimed(eyes, np.asarray(scene.target))
     return _shaken(Ts, _tremor(rng, times, np.radians(tremor_deg)))
 
 
 def _turning(scene: Scene, rng: np.random.Generator, times: Array, angle: Array, speed: float) -> Array:
-    """Camera near home at a mean speed in m/s, turned by angles (N,) in radians."""
     aims = _turned(scene.target - scene.home[:3, 3], angle)
     eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, speed * scene.mover_scale))
     return _shaken(_aimed(eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
@@ -110,7 +102,7 @@ def _dolly(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
 
 
 def follow(scene: Scene, rng: np.random.Generator, times: Array, mover: SyntheticMover) -> Array:
-    """Camera that follows a mover with the delay of a hand, and aims at the target while the mover is absent."""
+    """Camera that follows a mover with a hand's delay, else aims at the target."""
 
     def aim(t: float) -> Array:
         if not mover.present(t):
@@ -139,7 +131,7 @@ FOLLOW = "follow"
 
 
 def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers: list[SyntheticMover]) -> Array:
-    """Poses Ts_world_camera (N, 4, 4) of a built-in path or a trajectory file at ``times`` (N,), which start at 0."""
+    """Poses (N, 4, 4) of a built-in path or a file at ``times`` (N,), from 0."""
     rng = np.random.default_rng([seed, 2])
     if str(path) == FOLLOW:
         if not movers:
@@ -154,11 +146,8 @@ def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers
 
 
 def placed(trajectory: Trajectory, scene: Scene, times: Array, name: str) -> Array:
-    """Recorded trajectory, resampled at ``times`` and placed in the scene by a rigid motion.
-
-    The mean orientation becomes the home pose's. The centre of the positions is placed as close to the home position as
-    the free space of the scene permits.
-    """
+    """Recorded trajectory, resampled at ``times`` and placed in the scene: mean orientation of home, centre as near to
+    home as free space permits."""
     start, end = trajectory.timestamps[0], trajectory.timestamps[-1]
     if times[-1] > end - start + 1e-6:
         raise ConfigError(

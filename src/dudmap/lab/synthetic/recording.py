@@ -24,15 +24,13 @@ from dudmap.lab.synthetic.sensors import Sensor, SensorModel, TimeOfFlightModel
 from dudmap.lab.synthetic.surface import count_views, tessellate
 
 NEAREST, FARTHEST = 0.3, 6.0
-"""Range of an ideal sensor, for the observed part of the surface, metres."""
+"""Range of an ideal sensor, metres."""
 DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480, depth_scale=5000.0)
 
 
 class MoverState(NamedTuple):
-    """State of a mover in one frame: identity (1, 2, ...), pose (4, 4), velocity (3,) in m/s (world frame), kind.
-
-    ``moving`` is whether it counts as dynamic in this frame.
-    """
+    """A mover in one frame: identity (1, ...), pose (4, 4), velocity (3,) in m/s (world frame), kind, and whether it
+    counts as ``moving``."""
 
     id: int
     T_world_mover: NDArray[np.float64]
@@ -45,7 +43,7 @@ class SyntheticSequence:
     """Sequence whose frames are rendered on access; ``sequence[i]`` always returns the same frame.
 
     Attributes:
-        faults: Errors of the sensor that its files do not state.
+        faults: Errors that the sensor's files do not state.
         timestamps: (N,) seconds.
     """
 
@@ -96,26 +94,20 @@ class SyntheticSequence:
         return self._both(index)[0]
 
     def mask(self, index: int) -> NDArray[np.bool_]:
-        """True dynamic mask (H, W): pixels that show a mover that moves in this frame.
-
-        A person always counts as moving. Any other mover moves if the mean speed of one of its points exceeds 0.01 m/s
-        over the frame's interval (half a frame before to half a frame after). A mover is labelled as a whole.
-        """
+        """True dynamic mask (H, W): people, and movers one of whose points exceeds 0.01 m/s over the frame's interval,
+        as a whole."""
         index = self._number(index)
         if index in self._kept:
             return self._kept[index][1].copy()
         return self._mask_of(self._render(index, with_color=False), index)
 
     def exact(self, index: int) -> Rendering:
-        """Ideal depth and visible primitive of a frame, and the light on the colour camera.
-
-        The colour has the place, time and lens of the colour camera, but no noise, exposure, white balance, vignetting
-        or compression.
-        """
+        """Ideal depth and primitive of a frame, and the light on the colour camera (its place, time and lens; no noise,
+        exposure, white balance, vignetting, compression)."""
         return self._render(self._number(index), with_color=True)
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
-        """Ideal depth (H, W) of a frame in metres, 0 if the ray hits nothing."""
+        """Ideal depth (H, W), metres, 0 = none."""
         return self._render(self._number(index), with_color=False).depth
 
     @property
@@ -125,11 +117,11 @@ class SyntheticSequence:
 
     @property
     def sensor_model(self) -> SensorModel | TimeOfFlightModel | None:
-        """Noise model of the sensor, None for an ideal one."""
+        """Noise model, None if ideal."""
         return self._sensor.model
 
     def movers(self, index: int) -> list[MoverState]:
-        """Movers that exist in a frame, visible or not."""
+        """Movers in a frame, visible or not."""
         index = self._number(index)
         t = float(self.timestamps[index])
         return [
@@ -139,11 +131,11 @@ class SyntheticSequence:
         ]
 
     def static_twin(self) -> "SyntheticSequence":
-        """Recording with the same camera path and sensor noise, but without movers."""
+        """Recording with the same path and noise, without movers."""
         return self._like(self.scene, [], self.parameters | {"movers": []})
 
     def in_scene(self, scene: Scene) -> "SyntheticSequence":
-        """Recording with the same camera path, movers and sensor noise in another scene."""
+        """Recording with the same path, movers and noise in another scene."""
         return self._like(scene, self._movers, self.parameters)
 
     def _like(self, scene: Scene, movers: list[SyntheticMover], parameters: dict[str, object]) -> "SyntheticSequence":
@@ -154,19 +146,17 @@ class SyntheticSequence:
         )  # fmt: skip
 
     def mover_numbers(self, index: int) -> NDArray[np.int16]:
-        """Identity (H, W) of the mover that a pixel shows, 0 for none; includes movers at rest."""
+        """Identity (H, W) of the visible mover, at rest too, 0 = none."""
         numbers = np.arange(1, len(self._movers) + 1, dtype=np.int16)
         return self._by_pixel(numbers, self._render(self._number(index), with_color=False))
 
     def surface(self, observed: bool = False) -> Mesh:
-        """True static surface in the world frame at the end of the sequence, with movers at rest during the last
-        second.
-
-        Triangles inside or between solids are omitted.
+        """True static surface at the end of the sequence, world frame, with resting movers, without triangles inside
+        solids.
 
         Args:
-            observed: Only the part seen in at least three of up to 120 evenly spread frames: not occluded by movers,
-                within the sensor's range, not at a grazing angle.
+            observed: Only parts seen in three of up to 120 even frames, within the sensor's range, not at a grazing
+                angle.
         """
         mesh = self._surface
         if not observed:
@@ -214,7 +204,6 @@ class SyntheticSequence:
         return replace(frame, depth=frame.depth.copy(), color=frame.rgb.copy()), mask
 
     def _with_errors(self, rendering: Rendering, index: int) -> Rendering:
-        """Ideal measurement without noise: depth with its systematic errors, colour with its exposure."""
         assert rendering.color is not None
         gain = float(self.exposure_gains[index])
         color = self._color_camera.exposed(rendering.color, float(self.timestamps[index]), gain)
@@ -223,7 +212,7 @@ class SyntheticSequence:
 
     @cached_property
     def exposure_gains(self) -> NDArray[np.float64]:
-        """Factors (N,) of the automatic exposure; they follow the mean brightness of small images of every frame."""
+        """Factors (N,) of the automatic exposure."""
         if not self.faults.auto_exposure:
             return np.ones(len(self))
         camera = self.color_camera.resized(max(self.camera.width // 8, 16), max(self.camera.height // 8, 16))
@@ -231,7 +220,7 @@ class SyntheticSequence:
         return exposure_gains(levels, self.timestamps, self.faults.auto_exposure)
 
     def sensor_truth(self) -> dict[str, object]:
-        """Errors of the sensor that its files do not state, for a JSON file."""
+        """Errors that the sensor's files do not state, for a JSON file."""
         truth = self.faults.truth(self.camera)
         if self._depth_faults:
             truth |= self._depth_faults.truth()
@@ -270,13 +259,11 @@ class SyntheticSequence:
         return replace(sharp, color=color)
 
     def _seen_by_color_camera(self, t: float, camera: Camera) -> NDArray[np.float32]:
-        """Colour (H, W, 3) at time ``t`` of an ideal camera at the place of the colour camera."""
         color = self._render_at(t, self._pose_at(t) @ self.faults.T_depth_color, camera, True).color
         assert color is not None
         return color
 
     def _pose_at(self, t: float) -> NDArray[np.float64]:
-        """Pose of the depth camera at any time, extrapolated with constant velocity."""
         stamps, Ts = self.timestamps, self.ground_truth.Ts_world_camera
         if stamps[0] <= t <= stamps[-1]:
             return self.ground_truth.interpolate(t)

@@ -1,4 +1,4 @@
-"""Ray tracing renderer: exact depth, colour and visible primitive of every pixel."""
+"""Ray tracing: exact depth, colour and primitive of every pixel."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from dudmap.lab.synthetic.textures import TEXTURES, build_atlas
 
 
 def over_rows(count: int, work: Callable[..., None], *arguments: object) -> None:
-    """Run the kernel ``work(row_from, row_to, *arguments)`` over ``count`` rows, in bands on all threads."""
+    """Run ``work(row_from, row_to, *arguments)`` over ``count`` rows on all threads."""
     run_bands(lambda start, stop: work(start, stop, *arguments), bands(count, max(count // 10, 1)))
 
 
@@ -25,10 +25,10 @@ class Rendering:
     """Image of an ideal camera.
 
     Attributes:
-        depth: (H, W) float32, metres, 0 if the ray hits nothing.
-        primitive: (H, W) int16, number of the visible primitive, -1 for none.
+        depth: (H, W) float32, metres, 0 = none.
+        primitive: (H, W) int16, -1 = none.
         color: (H, W, 3) float32 in 0..255, or None.
-        cosine: (H, W) float32, cosine of the angle between the ray and the surface normal, or None.
+        cosine: (H, W) float32, of the angle of incidence, or None.
     """
 
     depth: NDArray[np.float32]
@@ -38,10 +38,8 @@ class Rendering:
 
 
 class Renderer:
-    """Renderer of a fixed set of primitives at any poses: first the static ones, then the movers'.
-
-    The first ``len(scene.primitives)`` primitives are static; ``atlas`` holds the textures in use.
-    """
+    """Renderer of fixed primitives at any poses: ``len(scene.primitives)`` static ones, then movers'; ``atlas``:
+    textures."""
 
     def __init__(self, scene: Scene, primitives: list[Primitive]) -> None:
         self._scene = scene
@@ -64,14 +62,14 @@ class Renderer:
         gain: float = 1.0,
         vignette: float = 0.12,
     ) -> Rendering:
-        """Render an image of a camera, whose distortion is ignored, at T_world_camera (4, 4).
+        """Render an image at T_world_camera (4, 4), without distortion.
 
         Args:
-            Ts_world_mover: (M, 4, 4) poses of the movers' primitives.
-            present: (M,) which of them exist in this image.
+            Ts_world_mover: (M, 4, 4) of the movers' primitives.
+            present: (M,) which exist.
             with_color: Also compute the colour.
             gain: Exposure factor of the colour.
-            vignette: The brightness falls as 1 / (1 + vignette r^2), r = distance from the optical axis at unit depth.
+            vignette: Brightness falls as 1 / (1 + vignette r^2), r from the axis at unit depth.
         """
         T_camera_world = se3.inverse(T_world_camera)
         Ts = T_camera_world @ np.concatenate([self._static, Ts_world_mover])
@@ -99,11 +97,6 @@ class Renderer:
     def _bin(
         self, camera: Camera, Ts: NDArray[np.float64], exists: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Front-to-back order, smallest depths, and tile columns and rows covered by the box of each primitive.
-
-        A box is left of the plane x = s z through the camera if its support function along the normal is negative.
-        Columns and rows share planes: the test costs P (C + R).
-        """
         center, axes = Ts[:, :3, 3], Ts[:, :3, :3] * self._bounds[:, None, :]
         reach = np.abs(axes[:, 2]).sum(axis=1)
         nearest = center[:, 2] - reach

@@ -1,7 +1,7 @@
-"""Furniture and built-in static scenes (``scenes.toml``); z is up, lengths in metres.
+"""Furniture and static scenes (``scenes.toml``); z up, metres.
 
-A row of ``solids`` names a solid or furniture, its position (the start of a capsule or cylinder), its other measures,
-and a material. A row with ``repeat`` (first, end, step) is repeated with each of these numbers in place of every "*".
+A row of ``solids`` names solid or furniture, position (start of a capsule or cylinder), measures, material. ``repeat``
+(first, end, step) puts each number in place of every "*".
 """
 
 from collections.abc import Iterable, Iterator
@@ -37,7 +37,7 @@ SOLIDS = tables("synthetic/solids.toml")
 
 
 def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:
-    """Table of the given width, depth and height on four legs."""
+    """Table of a width, depth and height on four legs."""
     (x, y), (w, d, h) = center, size
     legs = [
         box((x + sx * (w / 2 - 0.05), y + sy * (d / 2 - 0.05), (h - 0.04) / 2), (0.06, 0.06, h - 0.04), material)
@@ -48,7 +48,7 @@ def table(center: tuple[float, float], size: tuple[float, float, float], materia
 
 
 def chair(center: tuple[float, float], yaw: float, material: Material) -> list[Primitive]:
-    """Chair with a cushion, its back towards +y before the rotation by ``yaw`` degrees."""
+    """Chair with its back towards +y, turned by ``yaw`` degrees."""
     materials = MATERIALS | {"back": material, "cushion": Material("plaid", (2.3, 2.3))}
     return [p.moved(pose((*center, 0), yaw)) for p in built(SOLIDS["furniture"]["chair"], materials)]
 
@@ -56,14 +56,14 @@ def chair(center: tuple[float, float], yaw: float, material: Material) -> list[P
 def poster(
     center: Vector, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
 ) -> Primitive:
-    """Picture on a wall (facing -y, or along x with ``side``), showing one quarter of the poster texture."""
+    """One quarter of the poster texture on a wall (facing -y, or along x with ``side``)."""
     (w, h), middle = size, ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25)
     material = Material("poster", (0.5 / w, 0.5 / h), middle, variation=0.05, faces=False)
     return box(center, (depth, w, h) if side else (w, depth, h), material)
 
 
 def shelf(center: tuple[float, float], width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
-    """Bookshelf standing at ``center``, open towards -y before the rotation by ``yaw`` degrees."""
+    """Bookshelf open towards -y, turned by ``yaw`` degrees."""
     height, depth = 0.42 * rows, 0.3
     parts = [
         box((-width / 2 + 0.01, 0, height / 2), (0.02, depth, height), WOOD),

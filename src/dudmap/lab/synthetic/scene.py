@@ -17,12 +17,12 @@ class Material:
     """Appearance of a surface.
 
     Attributes:
-        scale: Repeats of the texture per metre, across and down.
-        offset: Shift of the texture in repeats.
+        scale: Texture repeats per metre, across and down.
+        offset: In repeats.
         tint: Factors on red, green, blue.
-        variation: Relative amplitude of a low-frequency variation of the brightness.
-        glow: Emitted light, added to the reflected light (screens, lamps).
-        faces: Whether the faces of a box show different parts of the texture.
+        variation: Relative amplitude of low-frequency brightness.
+        glow: Emitted light (screens, lamps).
+        faces: Whether faces of a box differ.
     """
 
     texture: str = "plain"
@@ -34,19 +34,19 @@ class Material:
     faces: bool = True
 
     def row(self) -> list[float]:
-        """Parameters of the material in the order of the shading kernel (10 numbers)."""
+        """Parameters for the shading kernel (10 numbers)."""
         return [*self.scale, *self.offset, *self.tint, self.variation, self.glow, float(self.faces)]
 
 
 @dataclass(frozen=True, eq=False)
 class Primitive:
-    """One solid in the frame of its body; for static solids the body is the world.
+    """One solid in its body's frame; the world for static ones.
 
     Attributes:
         kind: BOX, ELLIPSOID, CAPSULE and CYLINDER (axis z), TORUS (around z).
-        half: Half extents in metres: box hx hy hz; ellipsoid semi-axes; capsule and cylinder (radius, radius, half
-            length of the axis); torus (ring radius, ring radius, tube radius).
-        T_body_primitive: (4, 4) pose in the frame of the body.
+        half: Half extents, metres: box hx hy hz; ellipsoid semi-axes; capsule and cylinder (radius, radius, half
+            length); torus (ring radius, ring radius, tube radius).
+        T_body_primitive: (4, 4).
     """
 
     kind: int
@@ -55,7 +55,7 @@ class Primitive:
     material: Material
 
     def bounds(self) -> NDArray[np.float64]:
-        """Half extents (3,) of the bounding box in the frame of the primitive."""
+        """Half extents (3,) of the bounding box, own frame."""
         hx, hy, hz = self.half
         if self.kind == CAPSULE:
             return np.array([hx, hy, hz + hx])
@@ -68,7 +68,7 @@ class Primitive:
         return replace(self, T_body_primitive=T @ self.T_body_primitive)
 
     def scaled(self, size: float) -> "Primitive":
-        """Primitive of a body that is ``size`` times as large, and its texture with it."""
+        """Primitive ``size`` times as large, with its texture."""
         T, (hx, hy, hz), (across, down) = self.T_body_primitive.copy(), self.half, self.material.scale
         T[:3, 3] *= size
         material = replace(self.material, scale=(across / size, down / size))
@@ -77,7 +77,7 @@ class Primitive:
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance (N,) in metres of points (N, 3) in the body frame; negative inside.
 
-        Exact except for the ellipsoid: there it is a first-order approximation with the correct sign.
+        Exact but for the ellipsoid, to first order.
         """
         R, t = self.T_body_primitive[:3, :3], self.T_body_primitive[:3, 3]
         local = (points - t) @ R
@@ -100,7 +100,7 @@ class Primitive:
 
 
 def pose(position: Vector = (0, 0, 0), yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Matrix:
-    """Rigid motion (4, 4): ``position`` in metres; rotation by roll (x), pitch (y), then yaw (z), in degrees."""
+    """Rigid motion (4, 4): ``position`` in metres; roll (x), pitch (y), yaw (z), degrees."""
     (ca, cb, cc), (sa, sb, sc) = (f(np.radians([yaw, pitch, roll])) for f in (np.cos, np.sin))
     T = np.eye(4)
     T[:3, :3] = (
@@ -113,7 +113,7 @@ def pose(position: Vector = (0, 0, 0), yaw: float = 0.0, pitch: float = 0.0, rol
 
 
 def look_at(eye: Vector, target: Vector, roll: float = 0.0) -> Matrix:
-    """Camera pose T_world_camera (4, 4) at ``eye``, aimed at ``target``, world z up, rolled by ``roll`` degrees."""
+    """T_world_camera (4, 4) at ``eye``, aimed at ``target``, z up, rolled by ``roll`` degrees."""
     forward = np.asarray(target, float) - np.asarray(eye, float)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -171,7 +171,7 @@ def torus(center: Vector, axis: Vector, ring: float, tube: float, material: Mate
 
 @dataclass(frozen=True)
 class Light:
-    """Point light: position (world frame, metres), strength, and fall-off per square metre."""
+    """Point light: position (world frame, metres), strength, fall-off per square metre."""
 
     position: tuple[float, float, float]
     strength: float = 0.6
@@ -180,19 +180,19 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Static scene with the places that camera paths and movers need; z is up, the floor is z = 0.
+    """Static scene with places for paths and movers; z up, floor z = 0.
 
     Attributes:
-        primitives: Static solids in the world frame.
-        space: ((3,), (3,)) corners of the box in which the camera may move.
-        extent: ((3,), (3,)) corners of the scene; surfaces outside are not part of the reference surface.
-        walk_line: Two floor points; walkers cross the view from the first to the second.
-        rest: Pose T_world_body (4, 4) at which boxes are put down or taken away (centre of the bottom face).
-        hinge: Pose of a door hinge at the floor; the closed leaf extends along its +x axis and opens against +y.
+        primitives: World frame.
+        space: ((3,), (3,)) box of the camera.
+        extent: ((3,), (3,)) box of the reference surface.
+        walk_line: Two floor points, along which walkers cross.
+        rest: T_world_body (4, 4) of put-down boxes (bottom centre).
+        hinge: Of a door at the floor; the leaf extends along +x and opens against +y.
         lights: Point lights.
-        detail: Edge length of the triangles of the reference surface, metres.
-        mover_scale: Factor on the size of movers (a small scene such as a desk has small movers).
-        ground: Height on which the movers stand, metres.
+        detail: Triangle edges of the reference surface, metres.
+        mover_scale: Size of movers.
+        ground: Height of standing movers, metres.
     """
 
     name: str
@@ -212,5 +212,5 @@ class Scene:
     ground: float = 0.0
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Distance (N,) in metres from points (N, 3) to the nearest static solid; negative inside one."""
+        """Distance (N,), metres, from points (N, 3) to the nearest solid; negative inside."""
         return np.min([p.distance(points) for p in self.primitives], axis=0)

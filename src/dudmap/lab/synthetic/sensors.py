@@ -1,7 +1,4 @@
-"""Sensors: noise models of depth and colour, and five common RGB-D cameras.
-
-An unknown name raises a ``ConfigError``.
-"""
+"""Sensors: noise models, and five common cameras. Unknown names raise a ``ConfigError``."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -26,11 +23,11 @@ class NoiseModel:
 
     Attributes:
         lateral: Standard deviation of the lateral noise, pixels.
-        nearest, fade, farthest: Range, metres; the share of missing depth grows between fade and farthest.
-        grazing: Cosine of the angle of incidence below which depth is lost.
-        edge_loss: Share of depth lost at a depth edge: on its far side, for time of flight on both.
-        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
-        color_noise: Standard deviation of the colour noise, grey values.
+        nearest, fade, farthest: Range, metres; missing depth grows between fade and farthest.
+        grazing: Cosine of incidence below which depth is lost.
+        edge_loss: Share lost at a depth edge: far side, time of flight both.
+        correlation: Gaussian of correlated errors, pixels.
+        color_noise: Standard deviation, grey values.
     """
 
     lateral: float
@@ -46,13 +43,13 @@ class NoiseModel:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorModel(NoiseModel):
-    """Sensor with noise in the disparity ``d = fx b / z``, so that sigma_z = sigma z^2 / (fx b) (thesis eq. 3.91).
+    """Noise in the disparity ``d = fx b / z``: sigma_z = sigma z^2 / (fx b) (thesis eq. 3.91).
 
     Attributes:
-        baseline: Distance from the camera to the projector or second camera on its right, metres.
-        depth_noise: Standard deviation of the depth at 1 m including the quantisation by ``step``, metres.
-        step: Quantisation step of the disparity, pixels.
-        fatten: Width by which near surfaces are dilated (foreground fattening of window matching), pixels.
+        baseline: To projector or second camera, metres.
+        depth_noise: Standard deviation at 1 m with quantisation by ``step``, metres.
+        step: Quantisation of disparity, pixels.
+        fatten: Dilation of near surfaces (window matching), pixels.
     """
 
     baseline: float
@@ -61,10 +58,7 @@ class SensorModel(NoiseModel):
     fatten: int
 
     def row(self, focal: float) -> NDArray[np.float64]:
-        """Parameters in the order of the kernel, for a focal length in pixels.
-
-        The variance step^2 / 12 of the quantisation is part of ``depth_noise``.
-        """
+        """Parameters for the kernel, for a focal length in pixels."""
         total = self.depth_noise * focal * self.baseline
         sigma = np.sqrt(max(total**2 - self.step**2 / 12, (0.3 * total) ** 2))
         numbers = (self.baseline, sigma, self.step, self.lateral, self.nearest, self.fade, self.farthest)
@@ -73,15 +67,15 @@ class SensorModel(NoiseModel):
 
 @dataclass(frozen=True, kw_only=True)
 class TimeOfFlightModel(NoiseModel):
-    """Sensor that measures the range, so that its noise does not follow z^2.
+    """Noise of the measured range:
 
-    The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 + slant z^1.5 (theta / (pi/2 - theta))^2
-    in metres. theta is the angle of incidence (form of Fankhauser et al. 2015).
+    noise[0] + noise[1] z + noise[2] z^2 + slant z^1.5 (theta / (pi/2 - theta))^2, metres, at the angle of incidence
+    theta (form of Fankhauser et al. 2015).
 
     Attributes:
-        noise: Coefficients of 1, z and z^2, metres.
-        slant: Coefficient of the term that grows with the angle of incidence, metres.
-        native_width: Width in pixels of the measurement, from which wider images are interpolated. 0: any.
+        noise: Of 1, z and z^2, metres.
+        slant: Metres.
+        native_width: Measured pixels, interpolated to wider images; 0: any.
     """
 
     noise: tuple[float, float, float]
@@ -89,7 +83,7 @@ class TimeOfFlightModel(NoiseModel):
     native_width: int = 0
 
     def row(self) -> NDArray[np.float64]:
-        """Parameters in the order of the kernel."""
+        """Parameters for the kernel."""
         numbers = (*self.noise, self.slant, self.lateral, self.nearest, self.fade, self.farthest)
         return np.array([*numbers, self.grazing, self.edge_loss, self.speckle])
 
@@ -99,18 +93,18 @@ def _model(row: dict[str, Any]) -> SensorModel | TimeOfFlightModel | None:
 
 
 SENSORS = {name: _model(row) for name, row in tables("synthetic/sensors.toml")["noise"].items()}
-"""Noise models by name; None is an ideal sensor. ``sensors.toml`` has the values and their sources."""
+"""Noise models by name; None is ideal; ``sensors.toml`` has values and sources."""
 
 
 class Sensor:
-    """Sensor, one of ``SENSORS``, that adds noise to ideal images; equal seeds and frame numbers give equal errors."""
+    """One of ``SENSORS`` on ideal images; equal seeds and frame numbers give equal errors."""
 
     def __init__(self, name: str, seed: int) -> None:
         self.model = find(name, SENSORS, "noise model")
         self._seed = seed
 
     def measure(self, rendering: Rendering, focal: float, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Depth (H, W) float32 in metres, 0 = missing, and colour (H, W, 3) uint8 of frame ``index``."""
+        """Depth (H, W) float32, metres, 0 = missing, and colour (H, W, 3) uint8 of frame ``index``."""
         exact, color, cosine = rendering.depth, rendering.color, rendering.cosine
         assert color is not None
         assert cosine is not None
@@ -136,7 +130,6 @@ def _measured_range(
     cosine: NDArray[np.float32],
     noise: tuple[NDArray[np.float32], NDArray[np.int64], np.uint64],
 ) -> NDArray[np.float32]:
-    """Depth (H, W) of a time-of-flight sensor at its native resolution, interpolated where valid."""
     height, width = exact.shape
     if not 0 < model.native_width < width:
         depth = np.empty_like(exact)
@@ -153,7 +146,6 @@ def _measured_range(
 
 @lru_cache(maxsize=2)
 def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Periodic correlated noise (S, S) of unit variance, and 65536 samples of the unit Gaussian."""
     rng = np.random.default_rng(7)
     frequency = np.fft.fftfreq(NOISE_SIZE)
     gain = np.exp(-2 * (np.pi * correlation) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))
@@ -165,9 +157,8 @@ def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]
 class CameraModel:
     """One camera as its driver delivers it: colour registered to depth.
 
-    ``faults`` holds only the errors that registration leaves; add ``color_translation`` and the like for unregistered
-    streams. ``field_of_view`` is the horizontal one of a 4:3 depth image, degrees. ``motion_blur`` is the exposure time
-    of the colour as a share of the frame interval.
+    ``faults``: only errors that registration leaves. ``field_of_view``: horizontal, of a 4:3 depth image, degrees.
+    ``motion_blur``: exposure time of the colour, share of the frame interval.
     """
 
     noise: str

@@ -1,4 +1,4 @@
-"""Set-up of a synthetic recording from names of scenes, movers, paths, situations and sensors."""
+"""Set-up of a synthetic recording from names."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,11 +30,11 @@ CAP_DISTANCE = 0.16
 
 @dataclass(frozen=True)
 class Situation:
-    """Modification of an ordinary sequence: its defaults, and shares of the duration in which it differs.
+    """Modification of a sequence: defaults, and shares of the duration.
 
     Attributes:
-        covered: Intervals in which the camera is covered.
-        elsewhere: Intervals in which the camera looks at another part of the scene.
+        covered: Intervals with a covered camera.
+        elsewhere: Intervals with a view of another part.
     """
 
     movers: tuple[str, ...]
@@ -69,12 +69,11 @@ def carried_elsewhere(Ts: Array, scene: Scene, times: Array, spans: tuple[tuple[
 def cover(
     times: Array, T_world_camera: Callable[[float], Array], spans: tuple[tuple[float, float], ...]
 ) -> SyntheticMover:
-    """Dark sheet in front of the camera, closer than the sensor range, in the intervals (shares of the duration)."""
+    """Dark sheet nearer than the sensor range, in the intervals (shares of the duration)."""
     sheet = box((0, 0, 0), (0.5, 0.4, 0.01), Material("denim", (2.0, 2.0), tint=(0.35, 0.3, 0.3)))
     duration = float(times[-1])
 
     def aside(t: float) -> float:
-        """Position of the sheet: 1 out of view, 0 covering the view."""
         closed = [
             smooth_step((t - begin * duration) / 0.15 + 1.0) - smooth_step((t - end * duration) / 0.15)
             for begin, end in spans
@@ -108,26 +107,24 @@ def sequence(
     """Set up a synthetic recording; its frames are rendered on access.
 
     Args:
-        scene: Name of a scene (``names()["scenes"]``).
-        movers: Names of the movers, () for none; None for one person, or the movers of the situation.
-        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or the path of the
-            situation.
-        noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or the sensor's.
-        speed: Speed of the movers in m/s; None for the natural speed of each.
-        coverage: Mean share of the image, 0 to 0.95, covered by a stream of people, which replaces the movers; 0 for
-            none.
-        start_dynamic: Whether the movers are in view in the first frame.
-        situation: Name of a difficult situation (``names()["situations"]``).
-        seed: Seed of path, appearance and noise; equal seeds give equal frames.
-        camera: Intrinsics, or width and height in pixels; None for 640x480. The view is the sensor's, else of 525 px
-            focal length at 640x480.
-        motion_blur: Exposure time as a share of the frame interval; None for 0, or the sensor's.
-        exposure_change: Relative amplitude of a slow oscillation of the exposure.
-        sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.
-        faults: Errors of the sensor that its files do not state; a mapping changes the faults of ``sensor``.
+        scene: Of ``names()["scenes"]``.
+        movers: Names, () for none; None for one person, or the situation's.
+        camera_path: Built-in path or TUM file; None for hand-held, or the situation's.
+        noise: Of ``names()["noise"]`` (``none`` is exact); None for ``kinect``, or the sensor's.
+        speed: Of the movers, m/s; None for natural speeds.
+        coverage: Mean share of the image, 0 to 0.95, of a stream of people instead of movers; 0 for none.
+        start_dynamic: Movers are in view in the first frame.
+        situation: Of ``names()["situations"]``.
+        seed: Of path, appearance and noise; equal seeds give equal frames.
+        camera: Intrinsics, or width and height, pixels; None for 640x480, with the sensor's view, else 525 px focal
+            length.
+        motion_blur: Exposure time, share of the frame interval; None for 0, or the sensor's.
+        exposure_change: Relative amplitude of a slow oscillation.
+        sensor: Of ``names()["sensors"]``: noise, motion blur, faults and view.
+        faults: Errors that the sensor's files do not state; a mapping changes the faults of ``sensor``.
 
     Raises:
-        ConfigError: An argument is invalid; the message names the known values.
+        ConfigError: An invalid argument; it names the known values.
     """
     _check("frames", frames, 1, 1_000_000)
     _check("fps", fps, 0.5, 1000)

@@ -1,4 +1,4 @@
-"""Faults of the frame stream between a sensor and the program, injected into any recording."""
+"""Faults of the frame stream, injected into any recording."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,17 +16,17 @@ from dudmap.lab.data import find
 
 Alteration = Callable[[Frame], Frame]
 SPAN = 0.4, 0.6
-"""Part of the recording with altered or missing frames, as shares of its frames."""
+"""Altered part of the recording, shares of its frames."""
 LONG_GAP, CLOCK_STEP = 10.0, 3600.0
-"""Length of a gap, and step of a clock adjustment, seconds."""
+"""Gap, and clock step, seconds."""
 BURST, BURST_SPACING = 5, 0.001
-"""Frames that arrive together, and the time between their stamps, seconds."""
+"""Frames that arrive together, and time between their stamps, seconds."""
 INVALID_SHARE = 0.3
 """Share of the pixels with invalid depth."""
 
 
 class Delivery(NamedTuple):
-    """One arriving frame: number in the recording, its stamp (s), and the alteration of its images."""
+    """One arriving frame: number, stamp (s), alteration."""
 
     number: int
     timestamp: float
@@ -37,14 +37,14 @@ Schedule = Callable[[NDArray[np.float64]], list[Delivery]]
 
 
 class StreamFault(NamedTuple):
-    """A fault: description for tables, and the deliveries of a recording from its stamps."""
+    """A fault: description, and deliveries by stamps."""
 
     description: str
     schedule: Schedule
 
 
 class FaultyStream:
-    """A recording as it arrives, in ``deliveries``, with one of ``FAULTS``; its stamps need not increase."""
+    """A recording with one of ``FAULTS``; stamps need not increase."""
 
     def __init__(self, recording: Sequence, fault: str) -> None:
         self.recording = recording
@@ -94,7 +94,6 @@ def _duplicated(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _out_of_order(times: NDArray[np.float64]) -> list[Delivery]:
-    """Every tenth frame arrives before the two that precede it."""
     items = _plain(times)
     for late in range(10, len(items), 10):
         items[late - 2 : late + 1] = [items[late], items[late - 2], items[late - 1]]
@@ -102,7 +101,6 @@ def _out_of_order(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
-    """In the span frames arrive in bursts, stamped on arrival."""
     items = _plain(times)
     first, stop = _span(times)
     for start in range(first, stop - BURST + 1, BURST):
@@ -113,14 +111,12 @@ def _bursts(times: NDArray[np.float64]) -> list[Delivery]:
 
 
 def _missing(times: NDArray[np.float64], gap: float) -> list[Delivery]:
-    """The frames of the span are missing; it lasts ``gap`` seconds longer."""
     first, stop = _span(times)
     kept = [item for item in _plain(times) if not first <= item.number < stop]
     return [item._replace(timestamp=item.timestamp + gap * (item.number >= stop)) for item in kept]
 
 
 def _later(times: NDArray[np.float64], step: float, frames: int | None = None) -> list[Delivery]:
-    """Add ``step`` seconds to the stamps of ``frames`` frames (None: all) from the start of the span."""
     items, (first, _) = _plain(times), _span(times)
     stop = len(items) if frames is None else first + frames
     return [item._replace(timestamp=item.timestamp + step * (first <= item.number < stop)) for item in items]

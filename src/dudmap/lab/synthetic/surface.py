@@ -1,4 +1,4 @@
-"""Triangle mesh of the true static surface, and the part of it that the camera saw."""
+"""Triangle mesh of the true static surface, and its observed part."""
 
 from collections.abc import Iterable
 
@@ -45,7 +45,6 @@ def _box(half: tuple[float, float, float], detail: float) -> tuple[Points, Point
 
 
 def _profile(primitive: Primitive, fine: float, detail: float) -> tuple[Points, Points]:
-    """Outline (K, 2) of (radius, z) from the top downwards, and its normals (K, 2), of a solid of revolution."""
     hx, _, hz = primitive.half
 
     def arc(radius: float, start: float, stop: float) -> Points:
@@ -74,7 +73,6 @@ def _profile(primitive: Primitive, fine: float, detail: float) -> tuple[Points, 
 
 
 def _divided(values: Points, pieces: Points) -> Points:
-    """Values (K, 2) with ``pieces`` (K - 1,) equal steps between neighbours."""
     counts = np.maximum(pieces, 1).astype(int)
     at = np.repeat(np.arange(len(counts)), counts)
     share = (np.arange(len(at)) - (np.cumsum(counts) - counts)[at] + 1) / counts[at]
@@ -103,7 +101,6 @@ def _revolved(primitive: Primitive, detail: float) -> tuple[Points, Points, Face
 
 
 def _colors(primitive: Primitive, local: Points, normals: Points, detail: float, atlas: NDArray[np.int32]) -> Points:
-    """Texture colour (N, 3) in 0..255, without light, at points of the surface."""
     material = primitive.material
     axis = np.abs(normals).argmax(axis=1)
     s = np.where(axis == 0, local[:, 1], local[:, 0])
@@ -126,10 +123,10 @@ def tessellate(
     extent: tuple[tuple[float, float, float], tuple[float, float, float]],
     atlas: NDArray[np.int32],
 ) -> Mesh:
-    """Mesh of all surfaces that border free space.
+    """Mesh of all surfaces that border free space, without triangles inside solids or outside ``extent`` (two corners,
+    m).
 
-    Triangles whose front is inside another solid, or outside ``extent`` (two corners, m), are omitted. Vertices are
-    exact; flat surfaces are exact everywhere, curved ones to about ``detail``^2 / (8 radius).
+    Vertices and flat surfaces are exact, curved ones to about ``detail``^2 / (8 radius).
     """
     pieces: list[tuple[Points, Points, Points, Faces]] = []
     low, high = np.asarray(extent[0]) - 1e-3, np.asarray(extent[1]) + 1e-3
@@ -188,10 +185,10 @@ def count_views(
     depth_range: tuple[float, float],
     grazing: float,
 ) -> NDArray[np.int32]:
-    """Number of views (V,) in which each vertex of a mesh in the world frame is seen.
+    """Views (V,) in which each vertex of a mesh in the world frame is seen.
 
-    Views are pairs of T_world_camera (4, 4) and the ideal depth image (H, W) in metres. Depths within ``depth_range``
-    count, and surfaces whose angle of incidence has at least the cosine ``grazing``.
+    Views are T_world_camera (4, 4) and ideal depth (H, W), metres. Depths within ``depth_range`` count, at a cosine of
+    incidence of at least ``grazing``.
     """
     counts = np.zeros(len(mesh.vertices), dtype=np.int32)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])

@@ -1,4 +1,4 @@
-"""Procedural textures: band-limited, with gradients at every scale, and reproducible from a seed."""
+"""Procedural textures with gradients at every scale, by seed."""
 
 from collections.abc import Callable
 from functools import cache
@@ -17,9 +17,10 @@ LEVELS = 10
 def fractal(
     rng: np.random.Generator, slope: float = 1.0, low: float = 1.0, high: float = 128.0, stretch: float = 1.0
 ) -> Image:
-    """Periodic noise (SIZE, SIZE) of unit variance with amplitude ~ frequency^-slope between two frequencies.
+    """Periodic noise (SIZE, SIZE) of unit variance, amplitude ~ frequency^-slope between two frequencies, cycles per
+    texture;
 
-    Frequencies are in cycles per texture; ``stretch`` > 1 elongates the pattern along the columns.
+    ``stretch`` > 1 elongates along the columns.
     """
     fx = np.fft.fftfreq(SIZE, 1 / SIZE)[None, :]
     fy = np.fft.fftfreq(SIZE, 1 / SIZE)[:, None]
@@ -43,8 +44,6 @@ def _plain(_: np.random.Generator) -> Image:
 
 
 def _noise(mean: float, *parts: tuple[float, ...], color: tuple[float, float, float] = (1, 1, 1)) -> Maker:
-    """Maker of a texture of noise: its mean, and of every part the amplitude and the arguments of ``fractal``."""
-
     def make(rng: np.random.Generator) -> Image:
         return _gray(np.asarray(sum((size * fractal(rng, *rest) for size, *rest in parts), mean)), color)
 
@@ -114,7 +113,6 @@ def _brick(rng: np.random.Generator) -> Image:
 
 
 def _poster(rng: np.random.Generator) -> Image:
-    """Four different pictures: blobs, discs, bars and lines of 'text'."""
     x, y = _grid()
     image = np.empty((SIZE, SIZE, 3))
     for quarter in range(4):
@@ -246,9 +244,9 @@ TEXTURES = tuple(_MAKERS)
 
 
 def build_atlas(names: set[str]) -> NDArray[np.int32]:
-    """Textures with mip maps, (number of textures, texels of all levels) int32; unused textures stay zero.
+    """Textures with mip maps, (textures, texels of all levels) int32, 0 if unused.
 
-    A texel is red | green << 8 | blue << 16, each 0..255.
+    A texel is red | green << 8 | blue << 16.
     """
     atlas = np.zeros((len(TEXTURES), sum((SIZE >> level) ** 2 for level in range(LEVELS))), dtype=np.int32)
     for number, name in enumerate(TEXTURES):
@@ -259,7 +257,6 @@ def build_atlas(names: set[str]) -> NDArray[np.int32]:
 
 @cache
 def _mip_maps(name: str) -> NDArray[np.int32]:
-    """Texels of all levels of a texture, finest first; cached."""
     image = np.clip(_MAKERS[name](np.random.default_rng([0, TEXTURES.index(name)])), 0.0, 1.0)
     levels = []
     for level in range(LEVELS):

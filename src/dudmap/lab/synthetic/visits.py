@@ -1,5 +1,4 @@
-"""Two visits to one place with exact ground truth: things appeared, disappeared, moved or got other colours between
-them."""
+"""Two visits to one place with true changes."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -29,17 +28,17 @@ TRUTH = "changes.json"
 SKINS = ("cardboard", "books", "plaid", "checks", "denim", "brick", "stripes", "paper")
 KINDS = {"appeared", "disappeared", "moved", "opened", "recoloured"}
 NEAREST, FARTHEST, GRAZING = 0.5, 4.5, 0.2
-"""Distances (m) and smallest cosine of the angle of incidence of an observed surface."""
+"""Distances (m) and smallest cosine of incidence of an observed surface."""
 VIEWS = 5
-"""Frames, of 30, that must see a surface, or look through it."""
+"""Frames, of 30, that see a surface, or look through it."""
 CLEAR = 0.03
-"""Distance behind a point, metres, that a ray must reach to see it empty: twice the noise of a Kinect at 2.5 m."""
+"""Distance behind a point, metres, of a ray through it: twice a Kinect's noise at 2.5 m."""
 LEAST_SEEN = 0.35
-"""Smallest observed share of the face of a changed thing (its longest edge times its middle one)."""
+"""Smallest observed share of a changed thing's face."""
 NORMAL_LENGTH = 0.05
-"""Length of normals in the comparison of sides that both visits saw, metres: 3 cm correspond to 35 degrees."""
+"""Length of normals in the comparison of sides, metres: 3 cm are 35 degrees."""
 GAP = 0.12
-"""Distance between things, and to neighbouring solids, metres."""
+"""Distance between things and solids, metres."""
 TRIES = 400
 
 
@@ -48,14 +47,14 @@ class TrueChange:
     """True change of a thing.
 
     Attributes:
-        kind: One of ``KINDS`` without "opened", or "unknown" if a visit could not see it.
+        kind: Of ``KINDS`` without "opened", or "unknown" if a visit could not see it.
         size: Longest edge, metres.
-        T_after_before: (4, 4) motion in the common frame of both visits; the identity if it did not move.
-        before, after: (n, 3) points of its surface that one visit saw and the other looked through, metres. Of a
-            recoloured thing, its surface in both visits.
-        symmetric: Whether rotations about its vertical axis preserve its shape.
-        common: Whether both visits saw enough of the same sides to identify it.
-        at: (3,) its centre before, or after if it was absent before.
+        T_after_before: (4, 4), common frame; identity if not moved.
+        before, after: (n, 3) surface that one visit saw and the other looked through, metres; of a recoloured thing, in
+            both visits.
+        symmetric: About its vertical axis.
+        common: Whether both visits saw the same sides.
+        at: (3,) centre before, else after.
     """
 
     thing: str
@@ -114,12 +113,12 @@ THINGS: dict[str, tuple[Callable[[np.random.Generator, float], list[Primitive]],
     "chair": (_chair, (0.9, 0.9), False), "shelf": (_shelf, (1.26, 1.68), False), "door": (_door, (1.95, 1.95), False),
     "poster": (_box, (0.3, 1.0), False),
 }  # fmt: skip
-"""Function that makes the solids at the origin, range of the longest edge in metres, and symmetry."""
+"""Maker of the solids, range of the longest edge in metres, symmetry."""
 
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A thing in the frame of each visit that contains it; a poster's solids are on its wall."""
+    """A thing in the frame of each visit; a poster's solids are on its wall."""
 
     name: str
     kind: str
@@ -130,10 +129,10 @@ class Thing:
 
 
 def parsed_changes(text: str) -> list[tuple[str, str]]:
-    """Names and kinds of ``chair:moved,box:appeared``; "none" is the empty list.
+    """Names and kinds of ``chair:moved,box:appeared``; "none" is empty.
 
     Raises:
-        ConfigError: A thing or a kind is unknown, or a kind does not suit the thing.
+        ConfigError: An unknown thing or kind, or an unsuitable kind.
     """
     out = []
     for part in (part.strip() for part in text.split(",") if part.strip() not in ("", "none")):
@@ -149,8 +148,6 @@ def parsed_changes(text: str) -> list[tuple[str, str]]:
 
 
 class _Stage:
-    """Free spots of a scene in view of its home camera, on which things are placed one after another."""
-
     def __init__(self, scene: Scene, recording: SyntheticSequence, rng: np.random.Generator) -> None:
         self.scene, self.rng, self.taken = scene, rng, list[Array]()
         camera = recording.camera.resized(64, 48)
@@ -163,8 +160,6 @@ class _Stage:
         self.spots = points[:-1][flat & near[:-1]]
 
     def put(self, solids: list[Primitive], around: Array | None = None) -> Array | None:
-        """Pose (4, 4) for a thing, None without room; with ``around``, at a random distance of 5 cm to 3 m from that
-        pose."""
         solid = _samples(solids)
         far = float(np.exp(self.rng.uniform(np.log(0.05), np.log(3.0))))
         for _ in range(TRIES):
@@ -197,7 +192,6 @@ class _Stage:
 
 
 def _samples(solids: list[Primitive]) -> Array:
-    """Points (n, 3) on the bounding boxes of solids, about 300."""
     axis = np.linspace(-1, 1, 5)
     grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     grid = grid[np.abs(grid).max(axis=1) == 1]
@@ -206,7 +200,6 @@ def _samples(solids: list[Primitive]) -> Array:
 
 
 def _placed(name: str, kind: str, stage: _Stage, size: float | None) -> Thing | None:
-    """Place a thing on free spots of the stage; None if it does not fit."""
     rng, scene = stage.rng, stage.scene
     make, (low, high), _ = THINGS[name]
     if name == "poster":
@@ -256,16 +249,16 @@ def visits(
     paths: tuple[str, str] = ("pan", "pan"),
     **options: Any,  # noqa: ANN401 - those of ``sequence``
 ) -> tuple[list[SyntheticSequence], list[TrueChange]]:
-    """Recordings before and after some changes, in one world frame, and the true changes visible in them.
+    """Recordings before and after changes, in one world frame, and the visible true changes.
 
     Args:
-        changes: Things and their changes, from ``parsed_changes``.
-        size: Longest edge of boxes, balls and bins, metres; drawn by default.
-        people: Whether people walk through the second visit.
-        other_light: Whether the lamps of the second visit are elsewhere.
+        changes: From ``parsed_changes``.
+        size: Longest edge of boxes, balls and bins, metres; None draws it.
+        people: Walk through the second visit.
+        other_light: Lamps of the second visit are elsewhere.
 
     Raises:
-        ConfigError: A name is unknown, or a thing finds no free place in view.
+        ConfigError: An unknown name, or no free place in view.
     """
     rng = np.random.default_rng([seed, 7])
     plain = sequence(scene, (), paths[0], seed=seed, **options)
@@ -294,7 +287,6 @@ def _is_same(a: Primitive, b: Primitive) -> bool:
 
 
 def _truth(thing: Thing, recordings: list[SyntheticSequence]) -> TrueChange:
-    """Visible part of a change: surface that one visit saw, the other saw or looked through."""
     recoloured = thing.kind == "recoloured"
     changed, shown, areas = [], [], []
     for own, other, solids in zip(recordings, recordings[::-1], (thing.before, thing.after), strict=True):
@@ -357,10 +349,10 @@ def _looks_through(surface: Mesh, recording: SyntheticSequence) -> NDArray[np.in
 def write_visits(
     recordings: Sequence[SyntheticSequence], truth: Sequence[TrueChange], out: Path, *, overwrite: bool = False
 ) -> None:
-    """Write the recordings as visit-1 and visit-2, and their true changes, into a folder.
+    """Write visit-1, visit-2 and their true changes into a folder.
 
     Raises:
-        DatasetError: A folder is not empty, or cannot be written.
+        DatasetError: A folder has content, or cannot be written.
     """
     for number, recording in enumerate(recordings, start=1):
         write_folder(recording, out / f"visit-{number}", overwrite=overwrite)
