@@ -102,7 +102,6 @@ ELSEWHERE = {
     *("_mb", "_px", "color_k1", "overlap_min", "residual_mm_max"),  # endings, and names that are put together
     *("camera_configuration.calibration_parameters.left_cam", "prange", "associate.py"),  # of other programs
     *("fr1", "kitchen_filinha", "tsdf_sample"),  # recordings
-    "_evidence",  # on the page that is rewritten with the cues
 }
 
 
