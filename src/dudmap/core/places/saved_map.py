@@ -32,8 +32,8 @@ class SavedMap:
     """
 
     volume: TsdfVolume
-    keyframes: list[Keyframe]
-    registrations: RegistrationHistory = field(default_factory=RegistrationHistory)
+    keyframes: list[Keyframe] = field(repr=False)
+    registrations: RegistrationHistory = field(default_factory=RegistrationHistory, repr=False)
     folder: Path = Path()
 
     @classmethod

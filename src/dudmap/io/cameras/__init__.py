@@ -130,5 +130,5 @@ def driver(module: str, extra_name: str) -> Any:  # noqa: ANN401 - an optional p
     Raises:
         MissingExtraError: It is not installed, or a system library that it needs is missing.
     """
-    with extra(extra_name, f"a camera of the kind {extra_name}"):
+    with extra(extra_name, "the camera"):
         return import_module(module)
