@@ -188,8 +188,10 @@ def surface_tree(points: NDArray[np.floating]) -> KDTree:
 def noise_share(
     points: NDArray[np.float64], distances: NDArray[np.float64], limit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Standard deviation (n,) of distances (n,) between surfaces: 1.48 times a cell's median below a limit (n,), at
-    least the place's."""
+    """Standard deviation (n,) of distances (n,) between surfaces around points (n, 3).
+
+    It is 1.48 times a cell's median below a limit (n,), at least the place's.
+    """
     near = np.abs(np.nan_to_num(distances, nan=np.inf)) < limit
     if not near.any():
         return np.ones(len(points))

@@ -69,6 +69,7 @@ class Body:
     Attributes:
         points, normals: (n, 3) float64, common frame.
         colors: (n, 3) float64, 0..255.
+        denied: (n,) bool.
         tolerance: Noise, metres.
     """
 

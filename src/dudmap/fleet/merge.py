@@ -140,6 +140,7 @@ def merge_fleet(runs: Sequence[str | Path], out: str | Path, *, workers: int = 1
     Raises:
         ConfigError: A run is named twice, or voxels differ in size.
         MapError: An incomplete run folder, or no two runs can be joined.
+        DudmapError: ``out`` cannot be used.
     """
     folders, out = [Path(run) for run in runs], Path(out)
     like = check_runs(folders, out)

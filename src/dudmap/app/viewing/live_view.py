@@ -101,7 +101,11 @@ class LiveView(RunObserver):
                 self._changed.notify()
 
     def close(self) -> None:
-        """End the thread once all is shown."""
+        """End the thread once all is shown.
+
+        Raises:
+            Exception: Error of the page's thread.
+        """
         with self._changed:
             self._closed = True
             self._changed.notify()

@@ -74,6 +74,7 @@ class Cleaner:
 
     Raises:
         DatasetError: No masks, poses of another recording, or no pose of the colour camera.
+        MapError: There is no map.
     """
 
     def __init__(self, run: RunContent, sequence: "Sequence") -> None:

@@ -133,7 +133,7 @@ class Preprocessor:
         return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0
 
     def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Inverse of ``mask``; False at ignored pixels and outside the observation."""
+        """Inverse of ``mask`` (H, W); False at ignored pixels and outside the observation."""
         if self._ignored is not None and self._ignored_depth is not None:
             mask = mask & ~self._ignored_depth
         if self._inverse_map is None:

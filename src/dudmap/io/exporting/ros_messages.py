@@ -236,7 +236,7 @@ def seconds_of(message: Any) -> float:  # noqa: ANN401
 
 
 def camera_of(message: Any) -> Camera:  # noqa: ANN401
-    """Triangles of the mesh marker."""
+    """Camera of a ``sensor_msgs/CameraInfo``."""
     k = [float(value) for value in message.k]
     d = tuple(float(value) for value in message.d)
     if k[0] <= 0 or k[4] <= 0:

@@ -79,7 +79,7 @@ def search(folder: Path, depth: Size, color: Size) -> Intrinsics | None:
         depth, color: Image width and height.
 
     Raises:
-        Camera for the images that it fits, depth first, or None.
+        DatasetError: Files contradict each other, or none fits the images.
     """
     misfits: list[str] = []
     for place in (folder, folder.resolve().parent):

@@ -57,6 +57,7 @@ class MeasuredUp(NamedTuple):
     Attributes:
         direction: (3,) unit vector.
         sigma_deg: Root mean square angle, degrees.
+        readings: Number of measurements.
     """
 
     direction: NDArray[np.float64]

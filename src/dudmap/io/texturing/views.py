@@ -290,7 +290,7 @@ def levelled(
 def aligned(
     image: NDArray[np.uint8], expected: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Shift (h, w) of columns and rows onto the map's colours; 0 if none is found.
+    """Shift (h, w) of columns and rows of an image (h, w, 3) onto the map's colours; 0 if none is found.
 
     Compensates pose errors of a pixel or two by the affine motion of largest correlation (Evangelidis and Psarakis
     2008).

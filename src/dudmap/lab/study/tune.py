@@ -111,8 +111,7 @@ def judged(plan: Plan, measure: Measure) -> list[tuple[Point, dict[str, Any]]]:
 
     Returns:
         Values of the factors, and a row: per response and set the geometric mean ratio (NaN if failed), p of the first
-            response without improvement, and whether it holds.
-        Probability of ratios (recordings,) at most as large, if their logarithms had mean 0 (t test).
+        response without improvement, and whether it holds.
     """
     from statsmodels.stats.multitest import multipletests
 
