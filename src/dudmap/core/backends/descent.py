@@ -11,14 +11,14 @@ from dudmap.core.formulas.damping import accelerated, damped_step, judged, moved
 
 
 class DescentRules(NamedTuple):
-    """Start and stop rules of a descent.
+    """Start and stop rules.
 
     Attributes:
-        basis: (6, m) directions of a twist along which the pose may move.
-        damping: First damping, relative to the diagonal of H.
-        max_steps: Largest number of trial steps.
-        stop: Norm of a step (m, rad) below which it is the last one.
-        stop_gain: Relative change of the cost below which a short step is the last one.
+        basis: (6, m) directions of allowed twists.
+        damping: First one, relative to the diagonal of H.
+        max_steps: Trial steps.
+        stop: Norm of the last step (m, rad).
+        stop_gain: Relative cost change below which a short step is the last.
     """
 
     basis: NDArray[np.float64]
@@ -33,8 +33,8 @@ class Descent(NamedTuple):
 
     Attributes:
         T_world_camera: (4, 4) the last accepted pose.
-        equations: Normal equations of the last accepted step; the first ones if no step was accepted.
-        iterations: Number of linearisations.
+        equations: Of the last accepted step, or the first ones.
+        iterations: Linearisations.
         converged: Whether a stop criterion was met.
     """
 
@@ -50,11 +50,10 @@ def descend(
     first: NormalEquations | None,
     rules: DescentRules,
 ) -> Descent:
-    """Accelerated Levenberg-Marquardt steps; a step is accepted if it decreases the cost.
+    """Accelerated Levenberg-Marquardt steps; a step must decrease the cost, by the mean gradient (trapezoidal rule),
+    because pixels that enter or leave the map change costs more.
 
-    The change is estimated from the mean of the gradients before and after the step (trapezoidal rule). Pixels that
-    enter or leave the map change the costs more than short steps do. The CPU has the same loop as one compiled call
-    (``cpu/registration.py``).
+    The CPU has the same loop in ``cpu/registration.py``.
 
     Args:
         linearize: Returns the normal equations at a pose (4, 4).

@@ -1,6 +1,6 @@
-"""Choice of the compute device: the CPU, or an NVIDIA GPU with Warp (extra ``gpu``).
+"""Choice of the compute device: CPU, or NVIDIA GPU with Warp (extra ``gpu``).
 
-Warp is imported only if a GPU is requested or may be present. The driver is checked first, through its own library.
+Warp is imported only if needed, after a check of the driver.
 """
 
 import ctypes
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 OLDEST_DRIVER = (13, 0)
-"""CUDA version that the driver must support for the wheels of Warp from 1.19."""
+"""CUDA version for wheels of Warp from 1.19."""
 OLDEST_RELEASE = 580
-"""First driver that supports this version."""
+"""First driver for it."""
 OLDEST_GPU = 75
-"""Oldest compute capability, times ten, that CUDA 13 compiles for."""
+"""Oldest compute capability, times ten, of CUDA 13."""
 
 
 class DeviceWarning(RuntimeWarning):
@@ -34,13 +34,13 @@ class DeviceWarning(RuntimeWarning):
 
 
 def make_backend(device: str) -> Backend:
-    """A new back end on a device, or on the CPU if the device has failed in this process.
+    """A new back end on a device, or on the CPU after a failure in this process.
 
     Args:
         device: As for ``resolve``.
 
     Raises:
-        ConfigError: The device does not exist or does not work.
+        ConfigError: No such device, or it does not work.
     """
     name = resolve(device)
     if name == "cpu":
@@ -53,15 +53,15 @@ def make_backend(device: str) -> Backend:
 
 
 def resolve(device: str, *, adaptive: bool = False) -> str:
-    """Name of the selected device, "cpu", "warp-cpu" or "cuda:N"; "cpu" after a failure in this process.
+    """Selected device, "cpu", "warp-cpu" or "cuda:N"; "cpu" after a failure in this process.
 
     Args:
-        device: "cpu"; "cuda" or "cuda:1" for a GPU; "auto" for the first GPU that works, else the CPU; "warp-cpu" for
-            the GPU kernels on the CPU, for tests.
-        adaptive: Whether the map has several voxel sizes, which only the CPU supports.
+        device: "cpu"; "cuda" or "cuda:1"; "auto" for a working GPU, else the CPU; "warp-cpu" for GPU kernels on the
+            CPU, for tests.
+        adaptive: Several voxel sizes, which only the CPU supports.
 
     Raises:
-        ConfigError: The device does not exist, does not work, or does not support such a map.
+        ConfigError: No such device, a failure, or no support for the map.
     """
     if adaptive and device not in ("cpu", "auto"):
         raise ConfigError(
@@ -95,7 +95,6 @@ def _resolved(device: str) -> str:
 
 
 def _first_that_starts() -> str:
-    """The first GPU, or the CPU with a warning."""
     name = f"cuda:{supported_gpus()[0]}"
     if failure := start_failure(name):
         warnings.warn(f"{name} cannot be used ({failure}); the CPU is used", DeviceWarning, stacklevel=5)
@@ -104,7 +103,7 @@ def _first_that_starts() -> str:
 
 
 def obstacle() -> str:
-    """Reason why no GPU can be used, as part of a sentence; empty if one can."""
+    """Why no GPU can be used, as part of a sentence; empty if one can."""
     version = driver_version()
     if version is None:
         return "no NVIDIA driver was found"
@@ -127,7 +126,7 @@ def obstacle() -> str:
 
 @cache
 def start_failure(device: str) -> str:
-    """Reason why a device does not start, for example because other programs fill its memory; empty if it works."""
+    """Why a device does not start; empty if it does."""
     _load_warp()
     import warp as wp  # pyright: ignore[reportMissingImports]
 
@@ -147,7 +146,7 @@ def _driver() -> ctypes.CDLL | None:
 
 @cache
 def driver_version() -> tuple[int, int] | None:
-    """Newest CUDA version that the driver supports; None without a driver."""
+    """Newest CUDA version of the driver; None without a driver."""
     library, version = _driver(), ctypes.c_int(0)
     if library is None or library.cuDriverGetVersion(ctypes.byref(version)) != 0:
         return None
@@ -156,7 +155,7 @@ def driver_version() -> tuple[int, int] | None:
 
 @cache
 def warp_failure() -> str:
-    """Reason why the installed Warp does not start, as part of a sentence; empty if it does."""
+    """Why Warp does not start; empty if it does."""
     try:
         _load_warp()
     except (ImportError, OSError, RuntimeError) as error:
@@ -183,7 +182,6 @@ def _need_warp(device: str) -> None:
 
 @cache
 def _load_warp() -> None:
-    """Start Warp without its greeting and its warning about drivers."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     wp.config.log_level = wp.LOG_WARNING

@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 
 class Mirror:
-    """Host array and the copy that a back end may attach; rows are transferred when the other side needs them.
+    """Host array and an optional device copy; rows are transferred when needed.
 
     Args:
-        array: The array in host memory.
+        array: In host memory.
 
     Attributes:
-        array: The host array, without rows that only the device has written.
-        used: Number of leading rows in use; the device needs no copy of the others.
-        copy: Copy on a device (``RowCopy``); None on the CPU.
+        array: Without rows written only by the device.
+        used: Leading rows in use.
+        copy: ``RowCopy``; None on the CPU.
     """
 
     def __init__(self, array: NDArray) -> None:
@@ -24,13 +24,13 @@ class Mirror:
 
     @property
     def host(self) -> NDArray:
-        """The array, up to date; call ``wrote`` after changing it."""
+        """The array, up to date; call ``wrote`` after changes."""
         if self.copy is not None:
             self.copy.pull(self.array)
         return self.array
 
     def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
-        """Mark rows (n,), or all rows, as written in host memory."""
+        """Mark rows (n,), or all, as written by the host."""
         if self.copy is not None:
             self.copy.host_wrote(rows)
 
@@ -45,14 +45,14 @@ class Mirror:
 
 
 def on_host(array: "Mirror | NDArray") -> NDArray:
-    """An array unchanged, or the up-to-date array of a mirror."""
+    """An array, or the up-to-date array of a mirror."""
     if not isinstance(array, Mirror):
         return array
     return array.array if array.copy is None else array.host
 
 
 def grown(array: NDArray, capacity: int, value: int) -> NDArray:
-    """Copy of ``array`` with ``capacity`` rows; new rows hold ``value``."""
+    """Copy with ``capacity`` rows; new ones hold ``value``."""
     shape = (capacity, *array.shape[1:])
     out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
     out[: len(array)] = array

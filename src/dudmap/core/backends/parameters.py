@@ -1,7 +1,6 @@
-"""Inputs, parameters and results of the back-end operations (``core/backends/spec.py``).
+"""Inputs, parameters and results of back-end operations (``core/backends/spec.py``).
 
-Numba compiles named tuples directly. Tuples of parameters hold only floats; ``single`` converts them to float32 for
-loops.
+Numba compiles named tuples. Tuples of parameters hold only floats; ``single`` converts them to float32 for loops.
 """
 
 from functools import lru_cache
@@ -21,7 +20,7 @@ Parameters = TypeVar("Parameters", bound=tuple)
 
 @lru_cache(maxsize=64, typed=True)
 def single(parameters: Parameters) -> Parameters:
-    """The tuple, including nested ones, with every number as float32; cached per type and value."""
+    """The tuple, also nested, with float32 numbers; cached."""
     make: Any = type(parameters)
     return make(*(single(value) if isinstance(value, tuple) else np.float32(value) for value in parameters))
 
@@ -32,7 +31,7 @@ class SensorNoise(NamedTuple):
     Attributes:
         base: Metres.
         scale: 1/m.
-        reference: Reference depth, metres, at which noise is compared.
+        reference: Reference depth, metres.
     """
 
     base: float
@@ -41,12 +40,12 @@ class SensorNoise(NamedTuple):
 
 
 class TruncationBand(NamedTuple):
-    """Band around a surface in which distances are stored; ``core/formulas/pixel.py`` computes its width at a depth.
+    """Band around a surface with stored distances; see ``core/formulas/pixel.py``.
 
     Attributes:
-        front, behind: Smallest width on either side of the surface, metres.
-        sigmas: Smallest width, standard deviations of the depth.
-        limit: Largest distance that a voxel can store, metres.
+        front, behind: Smallest widths, metres.
+        sigmas: Smallest width, standard deviations.
+        limit: Largest stored distance, metres.
         noise: Noise of the sensor.
     """
 
@@ -62,13 +61,13 @@ class FusionParameters(NamedTuple):
 
     Attributes:
         band: Truncation band.
-        voxel_size: Edge of a voxel, metres.
-        sdf_unit: Metres per step of the stored distance.
-        depth_unit: Metres per step of 16-bit depth.
-        max_weight: Cap of a voxel's weight.
-        max_readings: Cap of a voxel's weight as a multiple of the weight of the fused measurement.
-        carve_rate: Weight of an observation of emptiness in a voxel that holds a surface.
-        depth_min, depth_max: Depth range, metres.
+        voxel_size: Metres.
+        sdf_unit: Metres per distance step.
+        depth_unit: Metres per 16-bit step.
+        max_weight: Cap of a voxel.
+        max_readings: Cap as a multiple of a measurement's weight.
+        carve_rate: Weight of emptiness in a voxel with a surface.
+        depth_min, depth_max: Metres.
     """
 
     band: TruncationBand
@@ -86,11 +85,10 @@ class RegistrationParameters(NamedTuple):
     """Parameters of the robust cost of a registration (thesis eq. 4.32-4.46).
 
     Attributes:
-        band: Truncation band; pixels farther from the surface are outliers.
-        huber: Huber constant of the distance residual, metres at the reference depth.
-        color_weight, color_huber: Weight and Huber constant of the intensity residual (0..1), used in the range from
-            ``darkest`` to ``brightest``.
-        sigma_at_reference: Each distance residual is scaled by this sigma, metres, over sigma(z).
+        band: Farther pixels are outliers.
+        huber: Of the distance residual, metres at the reference depth.
+        color_weight, color_huber: Of the intensity residual (0..1), between ``darkest`` and ``brightest``.
+        sigma_at_reference: Distance residuals are scaled by it, metres, over sigma(z).
     """
 
     band: TruncationBand
@@ -103,16 +101,16 @@ class RegistrationParameters(NamedTuple):
 
 
 class ColorProjection(NamedTuple):
-    """Projection of points of the depth camera into the colour image (``cpu/color_registration.py``).
+    """Projection of depth camera points into the colour image (``cpu/color_registration.py``).
 
     Attributes:
-        place, speed, bend: (3, 4) float32; point X is at place X - tau speed X + tau^2 / 2 bend X at time tau.
-        intrinsics: (4,) float32 of the colour camera.
-        distortion: (5,) float32 k1, k2, p1, p2, k3 of the colour camera.
-        offset: Time of the middle row of the colour image minus time of the middle row of the depth image, s.
-        readout: Time from the first to the last row of the colour image, s.
-        height: Rows of the colour image.
-        vignetting: Logarithm of the brightness in the middle of the colour image over the brightness in its corners.
+        place, speed, bend: (3, 4) float32; X is at place X - tau speed X + tau^2 / 2 bend X at time tau.
+        intrinsics: (4,) float32, colour camera.
+        distortion: (5,) float32 k1, k2, p1, p2, k3.
+        offset: Middle row of colour minus depth, s.
+        readout: First to last colour row, s.
+        height: Colour rows.
+        vignetting: Log brightness, centre over corners.
     """
 
     place: NDArray[np.float32]
@@ -127,7 +125,7 @@ class ColorProjection(NamedTuple):
 
 
 class RaycastParameters(NamedTuple):
-    """Limits of a view of the map: depths in metres, and the smallest weight of a trusted voxel (at least 1)."""
+    """Limits of a view: depths in metres, smallest trusted weight (at least 1)."""
 
     depth_min: float
     depth_max: float
@@ -138,10 +136,10 @@ class MeshParameters(NamedTuple):
     """Parameters of the surface extraction.
 
     Attributes:
-        voxel_size: Edge of a voxel, metres.
-        sdf_unit: Metres per step of the stored distance.
-        min_weight: Smallest weight of the corners of a meshed cell (at least 1).
-        max_jump: Largest change of the distance within a meshed cell, metres.
+        voxel_size: Metres.
+        sdf_unit: Metres per distance step.
+        min_weight: Of a meshed cell's corners (at least 1).
+        max_jump: Largest distance change in a meshed cell, metres.
     """
 
     voxel_size: float
@@ -154,15 +152,14 @@ class FilterParameters(NamedTuple):
     """Parameters of the preprocessing of a depth image (thesis section 4.3).
 
     Attributes:
-        depth_min, depth_max: Depth range that is kept, metres.
-        drop_mixed: Whether pixels between foreground and background are dropped.
-        steepest: Depth step per pixel of the steepest surface that is kept, as a share of the depth.
-        fill_holes: Whether small holes are filled.
-        hole_noise: Depth difference around a small hole that is always allowed, metres.
-        smooth: Whether the bilateral filter is applied.
-        alpha: sigma_c = alpha z^2 of the bilateral filter, and allowed depth difference around a hole, 1/m.
+        depth_min, depth_max: Kept range, metres.
+        drop_mixed: Drop pixels between foreground and background.
+        steepest: Depth step per pixel of the steepest surface, share of the depth.
+        hole_noise: Allowed depth difference around a hole, metres.
+        smooth: Apply the bilateral filter.
+        alpha: sigma_c = alpha z^2, and allowed difference around a hole, 1/m.
         sigma_px: Spatial standard deviation, pixels.
-        radius: Half width of the window, pixels.
+        radius: Of the window, pixels.
     """
 
     depth_min: float
@@ -178,7 +175,7 @@ class FilterParameters(NamedTuple):
 
     @property
     def spatial_weights(self) -> NDArray[np.float32]:
-        """Weights (radius + 1,) of the bilateral filter by the distance from its centre, pixels."""
+        """Weights (radius + 1,) by distance from the centre, pixels."""
         return np.exp(-(np.arange(self.radius + 1) ** 2) / (2 * self.sigma_px**2)).astype(np.float32)
 
 
@@ -188,15 +185,15 @@ class VoxelGrid(NamedTuple):
     Voxels and window are arrays, or mirrors with a copy on a device.
 
     Attributes:
-        window: (Wx * Wy * Wz,) int32: slot of the voxels of a block; -1 = unknown; -2 - entry = without voxels.
+        window: (Wx * Wy * Wz,) int32: slot of a block; -1 = unknown; -2 - entry = without voxels.
         shape: (3,) int64 blocks along each axis.
-        origin: (3,) int64 coordinates of the first block.
+        origin: (3,) int64 first block.
         geometry: (slots, 512) int32 packed voxels.
         colors: (slots, 512) int32 packed colours.
         slot_coords: (slots, 3) int32 block coordinates by slot.
-        free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
-        voxel_size: Edge of a voxel, metres.
-        sdf_unit: Metres per step of the stored distance.
+        free_count: (entries,) uint8 observations of emptiness.
+        voxel_size: Metres.
+        sdf_unit: Metres per distance step.
     """
 
     window: Mirror | NDArray[np.int32]
@@ -218,14 +215,14 @@ class VoxelGrid(NamedTuple):
 def to_lattice(
     T_world_camera: NDArray[np.float64], voxel_size: float, origin: NDArray[np.int64]
 ) -> NDArray[np.float32]:
-    """Camera to the lattice of a window (3, 4) float32: voxels, origin at the first voxel of its first block (3,)."""
+    """Camera to a window's lattice (3, 4) float32: voxels, origin at its first voxel."""
     T = T_world_camera[:3] / voxel_size
     T[:, 3] -= origin * BLOCK
     return T.astype(np.float32)
 
 
 class DepthTiles(NamedTuple):
-    """Depth range and share of pixels with depth, per tile of 8x8 pixels.
+    """Depth range and share with depth, per 8x8 pixels.
 
     Attributes:
         nearest, farthest: (h, w) float32, metres; inf and 0 without depth.
@@ -243,12 +240,12 @@ class DepthView(NamedTuple):
     Attributes:
         depth: (H, W) float32, metres, 0 = none.
         color: (H, W, 3) uint8.
-        used: (H, W) bool, pixels to fuse; the others change nothing.
-        weights: (H, W) uint8 weight of each pixel; None = cos(theta) / sigma(z) (thesis eq. 4.20).
+        used: (H, W) bool, pixels to fuse.
+        weights: (H, W) uint8; None = cos(theta) / sigma(z) (thesis eq. 4.20).
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
-        T_camera_world: (3, 4) float32, world to camera, metres, relative to the local origin of the window.
-        T_world_camera: (4, 4) float64, camera to the world of the map.
+        T_grid_camera: (3, 4) float32, camera to lattice, voxels.
+        T_camera_world: (3, 4) float32, world to camera, metres, relative to the window's local origin.
+        T_world_camera: (4, 4) float64.
     """
 
     depth: NDArray[np.float32]
@@ -267,7 +264,7 @@ class LevelImage(NamedTuple):
     Attributes:
         depth: (h, w) float32, metres, 0 = none.
         intensity: (h, w) float32 in [0, 1].
-        weights: (h, w) float32 static weights in [0, 1]; not used by ``sample``.
+        weights: (h, w) float32 static, in [0, 1]; not for ``sample``.
         intrinsics: (4,) float32 fx, fy, cx, cy.
     """
 
@@ -278,11 +275,11 @@ class LevelImage(NamedTuple):
 
 
 class FreeSpace(NamedTuple):
-    """Selection of blocks without voxels that are observed as empty: every second plane of the window.
+    """Blocks observed as empty: every second plane of the window.
 
     Attributes:
-        parity: 0 or 1, the first plane.
-        after: Observations that make a block known free space; it is not visited again.
+        parity: First plane, 0 or 1.
+        after: Observations of free space, not visited again.
     """
 
     parity: int
@@ -294,10 +291,10 @@ class BlockVisit(NamedTuple):
 
     Attributes:
         candidates: (n,) int32 slots that may be in view.
-        fused: (slots,) uint8 frames that were fused into each slot.
-        turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
-        repeats: Number of equal frames that this frame stands for.
-        free_space: Selection of the empty blocks to observe; None = none.
+        fused: (slots,) uint8 fused frames.
+        turn: Frame number, by which far blocks alternate; negative = all.
+        repeats: Equal frames that this one stands for.
+        free_space: Empty blocks to observe; None = none.
     """
 
     candidates: NDArray[np.int32]
@@ -308,13 +305,13 @@ class BlockVisit(NamedTuple):
 
 
 class TouchedBlocks(NamedTuple):
-    """An image prepared for fusion, and the blocks that it touches.
+    """An image prepared for fusion, and touched blocks.
 
     Attributes:
-        cells: (n,) int32, ascending, window cells of blocks without voxels that its truncation bands touch.
-        depth: (H, W) float32, metres, depth to fuse, 0 = none.
-        weights: (H, W) uint8, weight of each pixel.
-        tiles: Depth ranges of the tiles of the image.
+        cells: (n,) int32, ascending, touched window cells without voxels.
+        depth: (H, W) float32, metres, 0 = none.
+        weights: (H, W) uint8.
+        tiles: Depth ranges.
     """
 
     cells: NDArray[np.int32]
@@ -328,8 +325,8 @@ class FusedBlocks(NamedTuple):
 
     Attributes:
         slots: (n,) int32.
-        occupied: (n,) int32 voxels of each that hold a surface or were never observed.
-        empty: (m,) int32 window cells without an entry that were observed as empty; the caller stores them.
+        occupied: (n,) int32 voxels with a surface or never observed.
+        empty: (m,) int32 empty window cells without entry, for the caller to store.
     """
 
     slots: NDArray[np.int32]
@@ -338,7 +335,7 @@ class FusedBlocks(NamedTuple):
 
 
 class ImageStack(Protocol):
-    """Images of one size by number: an array (n, h, w), or images on a device, downloaded when they are read."""
+    """Images by number: an array (n, h, w), or images on a device, downloaded when read."""
 
     def __getitem__(self, number: int, /) -> NDArray[np.float32]: ...
 
@@ -349,11 +346,11 @@ class NormalEquations(NamedTuple):
     Attributes:
         H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
         b: (6,) float64, gradient of the cost.
-        cost: Robust cost; pixels off the map add a constant, so that poses can be compared.
-        num_inliers: Number of pixels on the map.
-        readings: Sum of the static weights of all pixels with depth.
-        weight: Sum of the static weights of the pixels on the map.
-        chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
+        cost: Robust; pixels off the map add a constant.
+        num_inliers: Pixels on the map.
+        readings: Static weights of all pixels with depth.
+        weight: Static weights on the map.
+        chi_square: Robust sum of squared distances, m^2 at one metre.
         residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
     """
 
@@ -368,11 +365,11 @@ class NormalEquations(NamedTuple):
 
 
 class MapSample(NamedTuple):
-    """The map at the points of a depth image.
+    """The map at a depth image's points.
 
     Attributes:
-        distance: (h, w) float32 signed distance in metres, NaN if unknown.
-        difference: (h, w) float32 map minus image intensity (0..1), NaN if unknown.
+        distance: (h, w) float32, metres, NaN if unknown.
+        difference: (h, w) float32, map minus image (0..1), NaN if unknown.
         occupancy: (h, w) uint8: UNKNOWN (also without depth), SURFACE or FREE.
     """
 
@@ -382,12 +379,12 @@ class MapSample(NamedTuple):
 
 
 class RaycastResult(NamedTuple):
-    """The map rendered at a pose: the thesis' artificial camera view.
+    """The rendered map: the thesis' artificial view.
 
     Attributes:
-        depth: (H, W) float32, metres, 0 = no surface.
+        depth: (H, W) float32, metres, 0 = none.
         color: (H, W, 3) uint8.
-        normals: (H, W, 3) float32, world frame, unit length, 0 = no surface.
+        normals: (H, W, 3) float32, world frame, unit length, 0 = none.
     """
 
     depth: NDArray[np.float32]

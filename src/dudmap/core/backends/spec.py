@@ -1,4 +1,4 @@
-"""Operations of a compute device: arrays and one tuple of parameters in, arrays out."""
+"""Operations of a compute device."""
 
 from typing import Protocol
 
@@ -21,11 +21,9 @@ from dudmap.core.backends.parameters import (
 
 
 class Backend(Protocol):
-    """Operations of a compute device; the CPU prepares images, finds labels, and makes meshes and views on every
-    device.
+    """Operations of a compute device; the CPU prepares images, labels, and makes meshes and views for every device.
 
-    A back end may reuse buffers between calls: each map has its own, and calls on one must not run concurrently.
-    Results do not depend on the number of threads.
+    Each map has its own back end, which may reuse buffers and must not run concurrently.
     """
 
     # -- integrate ---------------------------------------------------------------------------------------------------
@@ -42,19 +40,17 @@ class Backend(Protocol):
         """Prepare an image for fusion, and find the blocks without voxels that its truncation bands touch.
 
         Args:
-            stamps: (cells,) number of the last frame that found each cell, increasing; changed here.
-            free_after: Observations that make a block known free space.
+            stamps: (cells,) last frame that found each cell; changed.
+            free_after: Observations of free space.
         """
         ...
 
     def fuse(
         self, grid: VoxelGrid, view: DepthView, touched: TouchedBlocks, visit: BlockVisit, parameters: FusionParameters
     ) -> FusedBlocks:
-        """Average an image into the voxels in view (eq. 4.18-4.23), and observe the free space in front of its
-        surfaces.
+        """Average an image into the voxels in view (eq. 4.18-4.23), and observe free space.
 
-        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``. ``touched`` is the result of ``touch`` for
-        the image.
+        Changes ``grid.geometry``, ``grid.colors`` and ``grid.free_count``; ``touched`` is of ``touch``.
         """
         ...
 
@@ -72,19 +68,18 @@ class Backend(Protocol):
         """Levenberg-Marquardt steps (eq. 4.43 with the weights of 4.46); see ``descent.py``.
 
         Args:
-            image: Image of a pyramid level.
+            image: Of a pyramid level.
             T_world_camera: (4, 4) first pose.
             first: Normal equations at the first pose; None if unknown.
-            rules: Start and stop rules; without steps the result contains the normal equations at the pose.
+            rules: Without steps the result has the equations at the pose.
         """
         ...
 
     def sample(
         self, grid: VoxelGrid, image: LevelImage, T_grid_camera: NDArray[np.float32], free_after: int
     ) -> MapSample:
-        """Signed distance, intensity difference and occupancy of the map at the points of an image.
+        """Signed distance, intensity difference and occupancy at an image's points.
 
-        ``T_grid_camera`` (3, 4) float32 maps the camera to the window's lattice (voxels). ``free_after`` observations
-        make free space.
+        ``T_grid_camera``: (3, 4) float32, camera to lattice (voxels). ``free_after`` observations make free space.
         """
         ...

@@ -1,7 +1,6 @@
-"""Thread pool for bands of rows, and the decorators that compile kernels.
+"""Thread pool for bands of rows, and decorators that compile kernels.
 
-Kernels are serial and release the GIL. Bands do not depend on the number of threads, and sums are added in band order.
-Results are therefore bit for bit the same on any number of cores.
+Kernels are serial and release the GIL; bands and their order are fixed, so that results do not depend on the cores.
 """
 
 import atexit
@@ -23,8 +22,6 @@ from dudmap.core.kernel_cache import store
 
 
 def _import_numba() -> None:
-    """Import the parts of Numba that its first kernel needs, without SciPy's linear algebra, which takes as long as
-    loading all kernels."""
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
         sys.modules[blas] = None  # pyright: ignore[reportArgumentType] - so that its import fails
@@ -46,7 +43,7 @@ _OPTIONS: dict[str, Any] = {
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator that compiles a kernel and caches it until its code or the code of an inlined function changes."""
+    """Compiles a kernel and caches it until its code or inlined code changes."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         kernel = njit(**(_OPTIONS | options))(function)
@@ -60,11 +57,11 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 class Scalar:
     """Device function: inlined into kernels; compiled on its own only when Python calls it.
 
-    Numba would make each function callable from Python and C and store it, which can take longer than compiling it.
+    Numba would make it callable from Python and C, which can take longer than compiling.
 
     Attributes:
         py_func: The Python function.
-        inlined: The dispatcher that Numba compiles into kernels.
+        inlined: The dispatcher for kernels.
     """
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
@@ -89,25 +86,20 @@ class Scalar:
 
 kernel = compiled()
 exact = compiled(fastmath=False)
-"""Decorator for loops over small images that round like NumPy, operation by operation."""
+"""Decorator for small loops that round like NumPy."""
 exact_scalar = partial(Scalar, fastmath=False)
 """Decorator for device functions of such loops; ``py_func`` is the same formula for whole images."""
 scalar = Scalar
-"""Decorator for device functions that are always inlined, because a call ends the vectorisation of the loop.
-Otherwise two forms with different rounding would exist, and the cache state would decide between them."""
+"""Decorator for device functions that are always inlined, for vectorisation and one rounding."""
 written_out = compiled(inline="always")
-"""Decorator for formulas that are inlined as source, so that the compiler orders their sums with the surrounding
-ones; slower to compile than ``scalar``."""
+"""Decorator for formulas inlined as source, whose sums join the surrounding ones; slower to compile."""
 
 Result = TypeVar("Result")
 
 
 @cache
 def num_threads() -> int:
-    """Number of cores this process may use; the environment variable DUDMAP_THREADS overrides it.
-
-    It is read once, because a frame needs it twenty times.
-    """
+    """Cores of this process; DUDMAP_THREADS overrides it. Read once."""
     override = os.environ.get("DUDMAP_THREADS", "")
     return int(override) if override.isdigit() and int(override) > 0 else _num_cores()
 
@@ -119,9 +111,9 @@ def _num_cores() -> int:
 
 @cache
 def _tasks() -> SimpleQueue[Callable[[], object] | None]:
-    """Task queue of the other threads, one for each core but one. An executor takes ten times as long to wake one.
+    """Task queue of the other threads, one per core but one, faster than an executor.
 
-    The threads end before the interpreter does: a thread in compiled code would abort the process.
+    They end before the interpreter, which a thread in compiled code would abort.
     """
     tasks: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
 
@@ -151,7 +143,7 @@ def submit(function: Callable[[], Result]) -> Callable[[], Result]:
     """Start ``function`` in another thread if a core is available.
 
     Returns:
-        A function that waits for the result; if no thread has started yet, the caller computes it.
+        A function that waits for the result, or computes it if no thread has started.
     """
     if num_threads() <= 1:
         result = function()
@@ -178,13 +170,13 @@ def submit(function: Callable[[], Result]) -> Callable[[], Result]:
 
 
 def also_in_other_threads(function: Callable[[], object], count: int) -> None:
-    """Make ``count`` other threads call a function; it may be called late, when no work is left."""
+    """Make ``count`` other threads call a function, perhaps late."""
     for _ in range(count):
         _tasks().put(function)
 
 
 def bands(n: int, size: int) -> list[tuple[int, int]]:
-    """Ranges (start, stop) of ``size`` that cover 0 to ``n``; they do not depend on the number of threads."""
+    """Ranges (start, stop) of ``size`` from 0 to ``n``."""
     return [(start, min(start + size, n)) for start in range(0, n, size)]
 
 

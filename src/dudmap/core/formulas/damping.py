@@ -6,22 +6,22 @@ from dudmap.core.backends.threads import scalar
 from dudmap.core.geometry.se3 import rodrigues
 
 FLOOR = 1e-9
-"""Share of the largest diagonal element that is always added, so that unobservable directions get a zero step."""
+"""Share of the largest diagonal element always added, for zero steps in unobservable directions."""
 FACTOR, LEAST = 5.0, 1e-6
-"""Factor by which the damping grows and shrinks, and its lower bound."""
+"""Factor of the damping, and its lower bound."""
 LONGEST, SHORTEST = 3.0, 0.5
-"""Largest and smallest length of an accelerated step, as multiples of the plain step."""
+"""Largest and smallest accelerated step, in plain steps."""
 SHORT_STEP = 4.0
-"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes."""
+"""Length, in stop tolerances, of a step that ends a coarse level if the cost hardly changes."""
 
 _rotation = scalar(rodrigues)
 
 
 @scalar
 def damped_step(H, b, basis, damping):
-    """Solution (6,) of ``(H + damping diag(H)) step = -b``, restricted to the directions of a basis (6, m).
+    """Solution (6,) of ``(H + damping diag(H)) step = -b`` in a basis (6, m), H positive semidefinite.
 
-    H is symmetric and positive semidefinite. Unobservable directions get a zero step.
+    Unobservable directions get a zero step.
     """
     n, m = basis.shape
     largest = np.float64(0)
@@ -60,15 +60,13 @@ def damped_step(H, b, basis, damping):
 
 @scalar
 def accelerated(step, last, taken):
-    """Step (6,) of Anderson's acceleration with a memory of one step (Walker and Ni 2011).
-
-    With robust weights, each step is shorter than the previous one by about the same factor. The acceleration takes the
-    sum of these steps at once.
+    """Step (6,) of Anderson's acceleration with one step of memory (Walker and Ni 2011): steps shrink by a common
+    factor.
 
     Args:
         step: Plain step from this pose.
-        last: Plain step from the previous pose; zeros if there is none.
-        taken: Step taken from the previous pose to this one; zeros if there is none.
+        last: From the previous pose; zeros for none.
+        taken: From the previous pose to this one; zeros for none.
     """
     along, squared = np.float64(0), np.float64(0)
     for i in range(6):
@@ -97,12 +95,12 @@ def moved(T_world_camera, step):
 
 @scalar
 def judged(change, cost, length, damping, rules):
-    """Judge a trial step: whether it is accepted, the next damping, and whether it is the last step.
+    """Whether a trial step is accepted, the next damping, and whether it is the last.
 
     Args:
         change: Change of the cost by the step.
         cost: Cost before the step.
-        length: Norm of the step, metres and radians.
+        length: Metres and radians.
         damping: Damping of this step.
         rules: DescentRules.
     """

@@ -1,7 +1,7 @@
-"""Scalar formulas of a pixel: rays, rigid motions, projection, depth noise and truncation band.
+"""Formulas of a pixel: rays, motions, projection, depth noise, truncation band.
 
-Each function is plain arithmetic on float32 numbers, so that compilers other than Numba accept the same source. A rigid
-motion (3, 4) is passed as its twelve elements, row by row (``elements``).
+Plain arithmetic on float32, for other compilers than Numba. A rigid motion (3, 4) is passed as its twelve elements, row
+by row (``elements``).
 """
 
 import numpy as np
@@ -11,17 +11,16 @@ from dudmap.core.backends.threads import scalar, written_out
 
 f32, sqrt = np.float32, np.sqrt
 STEEPEST = f32(7.9)
-"""Tangent of 83 degrees, the largest angle between surface and image plane at which neighbours define the normal;
-sensors measure up to 84."""
+"""Tangent of 83 degrees, the largest angle to the image plane of a normal's neighbours; sensors measure up to 84."""
 UNKNOWN_COSINE = f32(0.3)
-"""Cosine of the angle of incidence assumed at depth edges."""
+"""Cosine of incidence assumed at depth edges."""
 
 _sigma = scalar(reading_sigma)
 
 
 @scalar
 def elements(T):
-    """Elements of a motion (3, 4), row by row, as a tuple: registers need no loads in inner loops."""
+    """Elements of a motion (3, 4) by rows, as a tuple in registers."""
     return (
         T[0, 0], T[0, 1], T[0, 2], T[0, 3],
         T[1, 0], T[1, 1], T[1, 2], T[1, 3],
@@ -31,7 +30,7 @@ def elements(T):
 
 @scalar
 def rotate(t, x, y, z):
-    """Apply the linear part of a motion to a vector."""
+    """Apply a motion's linear part to a vector."""
     return t[0] * x + t[1] * y + t[2] * z, t[4] * x + t[5] * y + t[6] * z, t[8] * x + t[9] * y + t[10] * z
 
 
@@ -47,13 +46,13 @@ def transform(t, x, y, z):
 
 @scalar
 def ray(u, c, f):
-    """Coordinate, at depth 1, of the ray through pixel coordinate ``u``; principal point ``c``, focal length ``f``."""
+    """Ray coordinate at depth 1 of pixel ``u``; principal point ``c``, focal length ``f``."""
     return (f32(u) - c) / f
 
 
 @scalar
 def project(x, by_z, f, c):
-    """Pixel coordinate of a point with coordinate ``x`` and reciprocal depth ``by_z`` (thesis eq. 4.4)."""
+    """Pixel of a point with coordinate ``x`` and reciprocal depth ``by_z`` (thesis eq. 4.4)."""
     return x * by_z * f + c
 
 
@@ -65,26 +64,23 @@ def sigma(z, noise):
 
 @scalar
 def band_front(z, band):
-    """Width of the truncation band in front of a measurement at depth ``z``, metres: at least ``band.sigmas``
-    sigma(z).
-    """
+    """Truncation band in front of a measurement, metres: at least ``band.sigmas`` sigma(z)."""
     return max(band.front, band.sigmas * sigma(z, band.noise))
 
 
 @scalar
 def band_behind(z, band):
-    """Width of the truncation band behind a measurement at depth ``z``, metres."""
+    """Truncation band behind a measurement, metres."""
     return max(band.behind, band.sigmas * sigma(z, band.noise))
 
 
 @written_out
 def free_depth(z, near, band):
-    """Depth up to which a pixel certainly sees free space, metres: the nearest depth around it minus its truncation
-    band.
+    """Depth of certain free space, metres: the nearest depth around minus its band.
 
     Args:
         z: Depth at the pixel, 0 = none.
-        near: Nearest depth of its neighbourhood.
+        near: Nearest depth around.
         band: TruncationBand.
     """
     free = near - min(band_front(near, band), band.limit)
@@ -93,16 +89,16 @@ def free_depth(z, near, band):
 
 @written_out
 def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
-    """Weight of a depth measurement, 1 to 16, 0 without one: cos(theta) / err(z) (eq. 4.20).
+    """Weight of a measurement, 1 to 16, 0 without: cos(theta) / err(z) (eq. 4.20).
 
     Args:
         z: Depth, metres.
-        left, right, up, down: Depths of the neighbouring pixels.
-        x, y: Coordinates of its ray at depth 1.
+        left, right, up, down: Neighbouring depths.
+        x, y: Ray at depth 1.
         fx: Focal length, pixels.
-        by_rows: Focal length in rows over the rows between ``up`` and ``down``.
-        best: Weight at normal incidence and the reference depth.
-        noise: SensorNoise, whose sigma(z) is err(z).
+        by_rows: Focal length in rows over rows between ``up`` and ``down``.
+        best: Weight at normal incidence and reference depth.
+        noise: SensorNoise; err(z) is sigma(z).
     """
     zero, half, one = f32(0), f32(0.5), f32(1)
     # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and its

@@ -1,6 +1,6 @@
-"""Formulas of a residual: trilinear interpolation, robust costs and weights, terms of the normal equations.
+"""Formulas of a residual: interpolation, robust costs and weights, normal equations.
 
-``weigh`` is the only implementation of the residual weight; ``residual_weights`` applies it to an image.
+``weigh`` is the only residual weight; ``residual_weights`` applies it to an image.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from dudmap.core.formulas.pixel import band_front, sigma
 
 f32 = np.float32
 GATE = f32(0.95)
-"""Share of the truncation band beyond which a pixel is not on the map."""
+"""Share of the truncation band of pixels on the map."""
 WORST_COLOR = f32(0.3)
-"""Intensity residual whose cost is charged to a pixel off the map."""
+"""Intensity residual charged to a pixel off the map."""
 
 
 @scalar
@@ -35,10 +35,7 @@ def trilinear(v0, v1, v2, v3, v4, v5, v6, v7, ax, ay, az):
 
 @scalar
 def within_range(shade, kx, ky, kz, intensity, p):
-    """Intensity difference between map and image, clipped to their common unsaturated range, and its gradient.
-
-    The gradient is 0 outside the range.
-    """
+    """Intensity difference, clipped to the unsaturated range, and its gradient, 0 outside."""
     inside = (shade > p.darkest) & (shade < p.brightest)
     part = f32(1) if inside else f32(0)
     difference = min(max(shade, p.darkest), p.brightest) - min(max(intensity, p.darkest), p.brightest)
@@ -68,19 +65,19 @@ def weigh(r, rc, z, static, known, p):
     """Weights and costs of the residuals of a pixel (thesis eq. 4.43-4.46).
 
     Args:
-        r, rc: Signed distance, metres, and intensity difference.
+        r, rc: Distance, metres, and intensity difference.
         z: Depth, metres, 0 = none.
         static: Static weight of the pixel.
-        known: Whether the map has a distance and an intensity there.
+        known: Whether the map has both.
         p: RegistrationParameters.
 
     Returns:
         - Whether the pixel is on the map.
-        - Its static weight if it is on the map, else 0.
+        - Its static weight there, else 0.
         - Its cost.
-        - The constant cost of a pixel off the map.
-        - Its weighted squared distance at one metre.
-        - The weight of the distance and the weight of the intensity.
+        - The cost off the map.
+        - Weighted squared distance at one metre.
+        - Weights of distance and intensity.
     """
     zero = f32(0)
     gate = band_front(z, p.band) * GATE
@@ -131,8 +128,7 @@ def residual_weights(
         parameters: Parameters of the linearisation.
 
     Returns:
-        (3, h, w) weights of distances, weights of intensities, and weighted squared distances at one metre; 0 off the
-        map.
+        (3, h, w) weights of distances and intensities, and weighted squared distances at one metre; 0 off the map.
     """
     out = np.zeros((3, *depth.shape), np.float32)
     images = (np.ascontiguousarray(image, np.float32) for image in (depth, residuals[0], residuals[1], static))
@@ -142,19 +138,19 @@ def residual_weights(
 
 @written_out
 def normal_terms(wg, wc, gx, gy, gz, kx, ky, kz, r, rc, x, y, z):
-    """Contribution of a pixel to the normal equations (thesis eq. 4.47).
+    """A pixel's terms of the normal equations (thesis eq. 4.47).
 
     With J = [g, p x g] and A = w g g', the blocks of J' w J are A, M = A hat(p)' and N = hat(p) M.
 
     Args:
-        wg, wc: Weights of the distance and of the intensity.
+        wg, wc: Weights.
         gx, gy, gz: Gradient of the distance.
         kx, ky, kz: Gradient of the intensity, 1/m.
         r, rc: Residuals.
         x, y, z: Point about the camera's centre, world axes, metres.
 
     Returns:
-        6 elements of the upper triangle of A, 9 of M, 6 of the upper triangle of N, and 6 of b, row by row.
+        Upper triangle of A (6), M (9), upper triangle of N (6), b (6), row by row.
     """
     a00 = wg * gx * gx + wc * kx * kx
     a01 = wg * gx * gy + wc * kx * ky

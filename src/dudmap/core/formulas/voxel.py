@@ -1,12 +1,11 @@
-"""Scalar formulas of a voxel: its packed words and the fusion of one measurement (thesis eq. 4.18-4.23).
+"""Formulas of a voxel: packed words, and fusion of a measurement (thesis eq. 4.18-4.23).
 
 A voxel is two int32 words:
 - geometry: sdf int16 (steps) << 16 | weight uint8 << 8 | intensity uint8;
 - colour: red << 20 | green << 10 | blue, each in quarters of a grey level.
 
 A pixel is two int32 words:
-- depth << 16 | free depth, both uint16 in steps of ``depth_unit``; the pixel certainly sees free space up to the free
-  depth;
+- depth << 16 | free depth, uint16 in ``depth_unit``; free space is certain up to the free depth;
 - red << 24 | green << 16 | blue << 8 | weight.
 """
 
@@ -18,9 +17,9 @@ from dudmap.core.formulas.words import bits, upper_half
 
 f32, i32, floor = np.float32, np.int32, np.floor
 SURFACE_SHARE = f32(0.9)
-"""Share of the truncation band within which a voxel counts as near a surface."""
+"""Share of the truncation band near a surface."""
 YOUNG = f32(8)
-"""Weight below which a voxel without colour takes the colour of any measurement in its truncation band."""
+"""Weight below which a voxel without colour takes any measurement's in its band."""
 
 
 @scalar
@@ -43,21 +42,21 @@ def intensity_of(word):
 
 @scalar
 def pack_voxel(steps, weight, intensity):
-    """Geometry word of a voxel; distance and intensity are rounded, the weight is truncated."""
+    """Geometry word; distance and intensity are rounded, the weight truncated."""
     half = f32(0.5)
     return (i32(floor(steps + half)) << i32(16)) | (i32(weight) << i32(8)) | i32(intensity + half)
 
 
 @scalar
 def pack_color(red, green, blue):
-    """Colour word of a voxel from channels in quarters of a grey level, rounded."""
+    """Colour word from channels in quarters of a grey level, rounded."""
     half = f32(0.5)
     return (i32(red + half) << i32(20)) | (i32(green + half) << i32(10)) | i32(blue + half)
 
 
 @scalar
 def pack_reading(depth, free_depth, by_unit):
-    """First word of a pixel: depth and free depth in steps of 1 / ``by_unit``."""
+    """First word of a pixel, in steps of 1 / ``by_unit``."""
     return (i32(depth * by_unit + f32(0.5)) << i32(16)) | i32(free_depth * by_unit)
 
 
@@ -78,21 +77,20 @@ def luma(color):
 def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
     """Fuse the pixel that a voxel projects to.
 
-    - Within the truncation band, distance, weight and intensity are averaged into the voxel.
-    - In free space in front of the band, the pixel observes emptiness. It counts ``carve_rate`` times in a voxel that
-      holds a surface, and changes no intensity.
-    - A black pixel changes no colour, because the scene may be unlit.
+    - Within the band, distance, weight and intensity are averaged.
+    - Free space in front observes emptiness, ``carve_rate`` times in a voxel with a surface.
+    - A black pixel changes no colour: the scene may be unlit.
 
     Args:
         word: Geometry word of the voxel.
         reading, color: Words of the pixel.
-        z: Depth of the voxel in the camera frame, metres.
-        repeats: Number of frames that this frame stands for.
+        z: Of the voxel, metres.
+        repeats: Frames that this one stands for.
         by_sdf_unit: 1 / ``p.sdf_unit``.
         p: FusionParameters.
 
     Returns:
-        New geometry word; share of the pixel's colour in the voxel's new colour, -1 = only if the voxel has none yet.
+        New geometry word; the pixel's share in the new colour, -1 = only without one.
     """
     zero, one = f32(0), f32(1)
     d = bits(reading, 16, 0xFFFF) * p.depth_unit
@@ -130,10 +128,7 @@ def is_occupied(word, p):
 
 @scalar
 def fuse_color(old, color, share):
-    """Colour word of a voxel after taking a pixel's colour with the share of ``fuse_voxel``.
-
-    A voxel without colour (0) takes all of it.
-    """
+    """Colour word after a pixel's share; without colour (0) all of it."""
     share = max(share, f32(0)) if old != 0 else min(abs(share) * f32(1e6), f32(1))
     r0, g0, b0 = bits(old, 20, 0x3FF), bits(old, 10, 0x3FF), bits(old, 0, 0x3FF)
     r1, g1, b1 = bits(color, 22, 0x3FC), bits(color, 14, 0x3FC), bits(color, 6, 0x3FC)

@@ -1,7 +1,4 @@
-"""Parts of packed 32-bit words, in 32-bit arithmetic.
-
-Numba widens every integer expression to 64 bits, which halves the throughput of vector instructions.
-"""
+"""Parts of packed words in 32-bit arithmetic, because Numba's 64 bits halve the throughput."""
 
 from llvmlite import ir
 from numba.core import types
@@ -10,7 +7,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def bits(typing_context, word, shift, mask):
-    """Bits of an int32 from ``shift`` upwards, as many as ``mask`` keeps (at most 24), as float32."""
+    """Bits of an int32 from ``shift``, by ``mask`` (at most 24), as float32."""
 
     def generate(context, builder, signature, arguments):
         word, shift, mask = (_as_int32(builder, argument) for argument in arguments)

@@ -1,6 +1,6 @@
 """CPU back end: Numba kernels over bands of rows, planes or blocks in a thread pool.
 
-Bands do not depend on the number of threads, and sums are added in band order (``threads.py``).
+Bands do not depend on the number of threads; sums are added in band order (``threads.py``).
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ from dudmap.core.backends.parameters import (
 )
 
 PIXELS_PER_BAND = 9600
-"""Pixels of one band of a linearisation; the coarsest level is one band."""
+"""Pixels of a linearisation's band."""
 _NO_VOXELS = np.empty(0, dtype=np.int32)
 
 
@@ -91,11 +91,6 @@ class CpuBackend:
         *,
         averages: bool = True,
     ) -> tuple[FusedBlocks, NDArray[np.float32], NDArray[np.int32]]:
-        """Blocks in view, number of frames (n,) that this frame stands for in each, and packed pixels; see
-        ``Backend.fuse``.
-
-        Without ``averages`` the voxels do not change; another device then fuses them.
-        """
         candidates, fused, turn, count, free_space = visit
         n, parity, after = len(candidates), *((-1, 0) if free_space is None else free_space)
         slots, repeats, occupied = np.empty(n, np.int32), np.empty(n, np.float32), np.empty(n, np.int32)
@@ -113,7 +108,6 @@ class CpuBackend:
         return FusedBlocks(slots[:total], occupied[:total], _concatenated(found, counts)), repeats[:total], pixels
 
     def _pixel_buffer(self, size: tuple[int, ...]) -> NDArray[np.int32]:
-        """Words (H * W + 1, 2) of the pixels; the last row, for voxels without a pixel, is 0."""
         rows = size[0] * size[1] + 1
         if len(self._pixels) != rows:
             self._pixels = np.zeros((rows, 2), dtype=np.int32)

@@ -1,7 +1,6 @@
-"""Loops over points seen by two frames: intensity and depth differences, and their derivatives.
+"""Loops over points seen by two frames: intensity and depth differences, and derivatives.
 
-Loads and rejection tests are separate loops. The remaining points fill rows without gaps, so that their arithmetic is
-vectorised.
+Loads and tests are separate loops, so that the arithmetic of the rest is vectorised.
 """
 
 import numpy as np
@@ -13,22 +12,17 @@ from dudmap.core.formulas.pixel import elements, rotate, sigma, transform
 f32 = np.float32
 UNKNOWNS = 21
 SHARED, POSE = 13, 6
-"""Parameters of the calibration (13), relative pose as a twist (6), gain and offset of the intensities (2)."""
+"""Unknowns: calibration (13), relative pose as a twist (6), gain and offset of the intensities (2)."""
 MARGIN = f32(8)
-"""Unused border of the colour images, pixels: twice the wider Gaussian of their filter."""
+"""Unused border of the colour images, pixels: twice the wider Gaussian."""
 NEAREST = f32(0.05)
-"""Smallest depth in the colour camera at which a point is visible, metres."""
+"""Smallest depth in the colour camera, metres."""
 POINTS, PADDED = 1040, 16
-"""Points processed together, whose rows begin at different cache positions, and size of a portion."""
+"""Points processed together, and size of a portion."""
 
 
 @scalar
 def _central(image, u, v):
-    """Value of an image at a position with sixteen neighbours, and its interpolated central differences.
-
-    Their noise is uncorrelated with the noise of the value; slopes between the four nearest pixels would bias all
-    estimates.
-    """
     i, j = int(u), int(v)
     a, b = u - f32(i), v - f32(j)
     p, q, r, s = image[j, i], image[j, i + 1], image[j + 1, i], image[j + 1, i + 1]
@@ -47,7 +41,7 @@ def _central(image, u, v):
 
 @scalar
 def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
-    """Projection of a point of the depth camera into a colour image.
+    """Projection of a depth camera's point into a colour image.
 
     Args:
         place: Elements of T_color_depth.
@@ -59,8 +53,8 @@ def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
         x, y, z: The point.
 
     Returns:
-        Pixel u, v. Then, for ``_by_point`` and ``_by_parameters``: point in the colour camera; its motion per second of
-        delay; its coordinates at depth 1; radial factor of the lens and its growth; share of the readout.
+        Pixel u, v; point in the colour camera; its motion per second of delay; coordinates at depth 1; radial factor
+        and its growth; share of the readout.
     """
     ax = twist[0] + twist[4] * z - twist[5] * y
     ay = twist[1] + twist[5] * x - twist[3] * z
@@ -91,7 +85,6 @@ def _seen(place, twist, intrinsics, lens, offset, readout, height, x, y, z):
 
 @scalar
 def _by_point(seen, intrinsics, lens, su, sv):
-    """Derivatives of su u + sv v by the point in the colour camera; u, v is the pixel of ``seen``."""
     qz, a, d, radial, growth = seen[4], seen[8], seen[9], seen[10], seen[11]
     across = f32(2) * (a * d * growth + lens[2] * a + lens[3] * d)
     along_x = radial + f32(2) * (a * a * growth + lens[2] * d) + f32(6) * lens[3] * a
@@ -141,8 +134,7 @@ def _six(values):
 
 @scalar
 def _add_products(rows, count, begin, place, H, b):
-    """Add the products of all rows to the normal equations; the last row holds the residuals. Unknowns before ``begin``
-    are omitted; unknown k is number ``place + k`` of ``H`` and ``b``."""
+    """Unknowns before ``begin`` are omitted; unknown k is number ``place + k`` of ``H`` and ``b``."""
     last, padded = len(rows) - 1, _padded(count)
     for k in range(begin, last + 1):
         for n in range(count, padded):
@@ -160,10 +152,9 @@ def _add_products(rows, count, begin, place, H, b):
 
 @scalar
 def _measured_points(start, stop, points, T, depth, intrinsics, step, residuals, number, at):
-    """Points ``start`` to ``stop`` at which the second depth image shows the same surface; returns their number.
+    """Points ``start`` to ``stop`` on the same surface of the second depth image; returns their number.
 
-    Fills ``number`` and the rows of ``at``: positions in both depth cameras, depth difference, and slopes of the depth
-    along u and v.
+    Fills ``number`` and rows of ``at``: positions in both depth cameras, depth difference, slopes along u and v.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -197,8 +188,6 @@ def _measured_points(start, stop, points, T, depth, intrinsics, step, residuals,
 
 @scalar
 def _depth_terms(count, at, intrinsics, noise, by_depth, huber, rows, plain):
-    """Derivatives of the depth differences of ``_measured_points`` by the pose, and the differences, times the root of
-    their weights, into ``rows``; the differences over ``noise`` into ``plain``."""
     fx, fy = intrinsics[0], intrinsics[1]
     for n in range(_padded(count)):
         x, y, z, difference = at[3, n], at[4, n], at[5, n], at[6, n]
@@ -218,9 +207,8 @@ def _depth_terms(count, at, intrinsics, noise, by_depth, huber, rows, plain):
 
 @scalar
 def _colored_points(count, tangents, first, second, number, at, pixels, shades):
-    """Keep the first ``count`` points that both colour images show at ``pixels``; returns their number. They move to
-    the front of ``number`` and ``at``, whose rows from 6 receive the tangents. ``shades`` receives values and
-    slopes."""
+    """Keep the points that both colour images show at ``pixels``; returns their number. They move to the front of
+    ``number`` and ``at``, whose rows from 6 receive the tangents; ``shades``: values and slopes."""
     height, width = f32(first.shape[0]) - MARGIN, f32(first.shape[1]) - MARGIN
     left = 0
     for n in range(count):
@@ -254,32 +242,30 @@ def linearize_pair(
 ):  # fmt: skip
     """Normal equations of the differences between two frames at the points of the first.
 
-    Both intensities show the same texture, so its gradient g in the second image is the mean of both images' gradients.
-    With the affinity A of the surface tangents, a step d_i in the first image is a step A d_i in the second. The
-    derivative by a parameter is g (d_j - A d_i). The difference of separate derivatives would be mostly noise, which
-    makes steps and covariances too small.
+    The gradient g in the second image is the mean of both images', because separate derivatives are mostly noise. With
+    the affinity A of the surface tangents, a step d_i in the first image is A d_i in the second: the derivative is g
+    (d_j - A d_i).
 
     Args:
         points: (n, 3) float32, camera of the first depth image.
-        tangents: (n, 6) float32, two directions of the surface at each point.
+        tangents: (n, 6) float32, two surface directions per point.
         T: (3, 4) float32, first to second depth camera.
         depth: (h, w) float32 of the second frame, metres, 0 = none.
         depth_intrinsics: (4,) float32.
         first, second: (h, w) float32 recorded colour intensities, NaN = unused.
         first_twist, second_twist: (6,) float32, motion of the depth camera per second.
-        first_offset, second_offset: Delay of the middle row of each colour image, s.
+        first_offset, second_offset: Delay of the middle row, s.
         place: (3, 4) float32 T_color_depth.
         intrinsics: (4,) float32 at the size of the colour images.
         lens: (5,) float32 k1, k2, p1, p2, k3.
-        scale: Size of the colour images over their full size.
-        readout: Readout of the colour images, s.
-        gain, bias: The second intensity is gain times the first plus bias.
-        step: Depth differences beyond this share of the depth belong to another surface.
+        scale: Colour image over full size.
+        readout: Of the colour images, s.
+        gain, bias: Second intensity = gain first + bias.
+        step: Largest depth difference of one surface, share of the depth.
         noise: SensorNoise, of float32.
-        by_color, by_depth: Reciprocal standard deviations of the intensity difference, and of the depth difference in
-            units of ``noise``.
+        by_color, by_depth: Reciprocal standard deviations of intensity, and of depth in ``noise``.
         huber: Constant of the robust weight, standard deviations.
-        begin: First unknown to compute: 0, or SHARED for a known calibration.
+        begin: First unknown: 0, or SHARED for a known calibration.
         residuals: (2, n) float32 out: intensity difference, depth difference over ``noise``; NaN = none.
         H: (UNKNOWNS, UNKNOWNS) float64 out.
         b: (UNKNOWNS,) float64 out, gradient.
@@ -364,21 +350,19 @@ def linearize_pairs(
     pairs, starts, points, tangents, Ts, depths, depth_intrinsics, images, twists, offsets, place, intrinsics, lens,
     scale, readout, lights, step, noise, by_color, by_depth, huber, begin, residual_starts, residuals, Hs, bs,
 ):  # fmt: skip
-    """``linearize_pair`` of several pairs of frames.
+    """``linearize_pair`` of several pairs, with its other arguments.
 
     Args:
-        pairs: (P, 2) int64, numbers of the first and the second frame of each.
-        starts: (F + 1,) int64, first point of each frame in ``points`` and ``tangents``.
+        pairs: (P, 2) int64, first and second frame.
+        starts: (F + 1,) int64, first point of each frame.
         points, tangents: (n, 3) and (n, 6) float32 of all F frames.
         Ts: (P, 3, 4) float32.
         depths, images: (F, h, w) float32.
-        twists, offsets: (F, 6) and (F,) float32, motion and delay of the middle row of the colour image of each frame.
+        twists, offsets: (F, 6) and (F,) float32, motion and delay of the middle colour row.
         lights: (P, 2) float32, gain and bias.
         residual_starts: (P + 1,) int64, first residual of each pair.
         residuals: (2, r) float32 out.
         Hs, bs: (P, UNKNOWNS, UNKNOWNS) and (P, UNKNOWNS) float64 out.
-
-    The others are as for ``linearize_pair``.
     """
     for n in range(len(pairs)):
         first, second = pairs[n, 0], pairs[n, 1]

@@ -1,6 +1,6 @@
-"""Loop over the pixels of a depth image: colour of each in the image of another camera, taken at another time.
+"""Loop over a depth image: colour of each pixel in another camera's image of another time.
 
-A row is processed in stages, see ``registration.py``.
+Rows are processed in stages, see ``registration.py``.
 """
 
 import numpy as np
@@ -11,12 +11,12 @@ from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import project, ray
 
 NEAREST = np.float32(0.05)
-"""Smallest depth in the colour camera, metres; nearer points are projected at this depth."""
+"""Smallest depth in the colour camera, metres, also of nearer points."""
 
 
 @scalar
 def fill_gaps(source, fallback, target):
-    """Fill the gaps in a row of depths with the last depth before them, and a gap at the start with the first depth."""
+    """Fill gaps in a row of depths with the last depth before them, or the first depth."""
     first = fallback
     for u in range(source.size):
         if source[u] > np.float32(0):
@@ -31,7 +31,7 @@ def fill_gaps(source, fallback, target):
 
 @scalar
 def _along_row(T, y):
-    """Motion (3, 4) of the points (x, y, 1) z of a row: factors of x z, factors of z, and shifts."""
+    """Motion (3, 4) of the points (x, y, 1) z of a row."""
     return (
         T[0, 0], T[1, 0], T[2, 0], T[0, 1] * y + T[0, 2], T[1, 1] * y + T[1, 2], T[2, 1] * y + T[2, 2],
         T[0, 3], T[1, 3], T[2, 3],
@@ -45,22 +45,20 @@ def _moved(t, x, z):
 
 @scalar
 def color_places(v, depth, intrinsics, projection, size, first, across, down, gain):
-    """Positions of a row of depth pixels in the colour image, clamped at its borders.
+    """Positions of a row of depth pixels in the colour image, clamped.
 
-    A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera. This is
-    T_color_depth exp(-tau xi) X to the second order. The time tau and row depend on each other. One fixed-point step
-    from the row of the depth image contracts the error by readout times image speed over height. With 20 rows between
-    the images, 30 ms and 1 rad/s at 480 rows, 0.02 pixels remain.
+    X lies at place X - tau speed X + tau^2 / 2 bend X: T_color_depth exp(-tau xi) X to the second order. One
+    fixed-point step for tau and row leaves 0.02 pixels with 20 rows between the images, 30 ms, 1 rad/s and 480 rows.
 
     Args:
         v: Row.
         depth: (w,) float32 of the row, metres.
-        intrinsics: (4,) float32 of the depth camera.
+        intrinsics: (4,) float32, depth camera.
         projection: ColorProjection.
-        size: Heights of the depth image and of the colour image, width of the colour image.
-        first: (w,) int32 out, number of the upper left of the four colour pixels around the point.
-        across, down: (w,) float32 out, position between them, 0 to 1.
-        gain: (w,) float32 out, factor that compensates vignetting.
+        size: Heights of depth and colour image, colour width.
+        first: (w,) int32 out, upper left of the four colour pixels.
+        across, down: (w,) float32 out, position, 0 to 1.
+        gain: (w,) float32 out, against vignetting.
     """
     zero, half, one, two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
     y_ray = ray(v, intrinsics[3], intrinsics[1])
@@ -107,14 +105,14 @@ def color_places(v, depth, intrinsics, projection, size, first, across, down, ga
 
 @scalar
 def blended(a, b, c, d, across, down):
-    """Bilinear interpolation between four pixels, the upper two first, at a position from 0 to 1 across and down."""
+    """Bilinear interpolation of four pixels, upper two first."""
     upper, lower = a + across * (b - a), c + across * (d - c)
     return upper + down * (lower - upper)
 
 
 @scalar
 def blended_byte(a, b, c, d, shift, across, down, gain):
-    """Bilinear interpolation of one byte of four words times a gain, rounded."""
+    """Bilinear interpolation of one byte of four words, times a gain, rounded."""
     byte = np.int32(255)
     value = blended(
         np.float32((a >> shift) & byte), np.float32((b >> shift) & byte), np.float32((c >> shift) & byte),
@@ -125,7 +123,7 @@ def blended_byte(a, b, c, d, shift, across, down, gain):
 
 @scalar
 def load_around(words, first, next_row, around):
-    """Load the four pixels around each point of a row (``color_places``) into ``around`` (4, w)."""
+    """Load the four pixels around each point of a row into ``around`` (4, w)."""
     for u in range(first.size):
         n = np.uintp(first[u])
         around[0, u], around[1, u] = words[n], words[n + np.uintp(1)]
@@ -135,7 +133,7 @@ def load_around(words, first, next_row, around):
 
 @scalar
 def blend_colors(around, across, down, gain, mixed, target):
-    """Interpolate colours between these pixels into a row of 3 w bytes; ``mixed`` (w,) int32 is overwritten."""
+    """Interpolate these into a row of 3 w bytes; ``mixed`` (w,) int32 is overwritten."""
     for u in range(mixed.size):
         a, b, c, d = around[0, u], around[1, u], around[2, u], around[3, u]
         red = blended_byte(a, b, c, d, 0, across[u], down[u], gain[u])
@@ -172,16 +170,16 @@ def register_rows(start, stop, depth, intrinsics, projection, fallback, size, wo
 
 @kernel
 def register(leads, team, rows, depth, intrinsics, projection, fallback, size, words, shades, colors):
-    """Interpolated colour or intensity of each pixel of a depth image, for a team of threads (``teams.py``).
+    """Interpolated colour or intensity of each depth pixel, for a team of threads (``teams.py``).
 
     Args:
         rows: Rows of a band.
-        depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
+        depth: (H, W) float32, metres, 0 = the depth of a neighbour in the row.
         intrinsics, projection, size: As for ``color_places``.
-        fallback: Float32, depth of rows without any depth, metres.
-        words: (h * w,) int32 of the colour image: red, green and blue in the lowest bytes, or the bits of a float32.
-        shades: (H, W) float32 out; of size 0 if the words are colours.
-        colors: (H, W, 3) uint8 out; of size 0 if the words are intensities.
+        fallback: Float32, depth of empty rows, metres.
+        words: (h * w,) int32, bytes red, green, blue from the lowest, or bits of a float32.
+        shades: (H, W) float32 out; size 0 for colours.
+        colors: (H, W, 3) uint8 out; size 0 for intensities.
     """
     wide_vectors()
     num_bands = -(-depth.shape[0] // rows)

@@ -1,5 +1,4 @@
-"""Consensus of point correspondences on a rigid motion: MSAC scores of hypotheses, Gauss-Newton on the inliers, and
-votes of the nearest neighbours."""
+"""Consensus on a rigid motion: MSAC scores, Gauss-Newton on inliers."""
 
 from typing import NamedTuple
 
@@ -11,24 +10,22 @@ from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.geometry.se3 import SMALL
 
 BANDS = 12
-"""Bands of a search, with equal numbers of hypotheses and of refined motions."""
+"""Bands of a search."""
 REFINED = 5
-"""Refined hypotheses per noise level, because three noisy corners seldom give the best motion directly."""
+"""Refined hypotheses per noise level: three noisy corners seldom give the best motion."""
 ROUNDS = 2.0, 1.0, 1.0
-"""Inlier thresholds of the refinement rounds, multiples of the usual one; the first is wider because three corners
-are noisy."""
+"""Inlier thresholds of the rounds, multiples of the usual; the first is wider."""
 REGULAR = 1e-9
-"""Added to the diagonals of linear systems: absolutely for samples with a repeated point, relative to the trace for
-least squares."""
+"""Added to diagonals: absolutely for repeated points, relative to the trace for least squares."""
 
 
 class ConsensusParams(NamedTuple):
     """Scales of the consensus, pixels.
 
     Attributes:
-        inlier_px: Smallest reprojection error of an outlier, one per noise level.
-        gain: Log-likelihood ratio of an error-free correspondence to an outlier, one per noise level.
-        prior_px: Mean distance from the expected image positions at which the prior of a motion is 3/4.
+        inlier_px: Smallest error of an outlier, per noise level.
+        gain: Log-likelihood ratio of an error-free correspondence to an outlier, per noise level.
+        prior_px: Mean distance from expected positions at a prior of 3/4.
     """
 
     inlier_px: tuple[float, ...]
@@ -37,13 +34,13 @@ class ConsensusParams(NamedTuple):
 
 
 class Correspondences(NamedTuple):
-    """Points and their observed image positions after a motion.
+    """Points and their image positions after a motion.
 
     Attributes:
         points: (3, n) float64, metres, first camera's frame.
         targets: (2, n) float64, their pixels in the second image.
-        expected: (2, n) float64, their pixels in the second image for the expected motion.
-        weights: (n,) float64, weight of each point in a score.
+        expected: (2, n) float64, for the expected motion.
+        weights: (n,) float64, of each point.
         intrinsics: (4,) fx, fy, cx, cy.
     """
 
@@ -57,10 +54,10 @@ class Correspondences(NamedTuple):
 def best_motion(
     draws: NDArray[np.int64], found: Correspondences, params: ConsensusParams, T_expected: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Motion (4, 4) of the highest score among the best hypotheses and the expected motion, all refined.
+    """Motion (4, 4) of the highest score among refined hypotheses and the expected motion.
 
     Args:
-        draws: (g, 3) correspondences of each hypothesis.
+        draws: (g, 3) correspondences per hypothesis.
         found: The correspondences.
         params: Scales of the scores.
         T_expected: (4, 4).
@@ -76,11 +73,8 @@ def best_motion(
 
 @kernel
 def search(leads, team, draws, found, params, T_expected, motions, scores, refined, refined_scores):
-    """Loop of ``best_motion``, for a team of threads.
-
-    The first step makes and scores the hypotheses. The second refines and scores the best ones of each noise level and
-    the expected motion.
-    """
+    """Loop of ``best_motion`` for a team of threads: score the hypotheses, then refine the best of each noise level and
+    the expected motion."""
     step, levels = 0, scores.shape[1]
     while step < 2:
         band, number = first_band(leads, team, step, BANDS)
@@ -129,7 +123,7 @@ def highest(scores):
 
 @scalar
 def solved(A, b):
-    """Solution (n,) of A x = b by Gaussian elimination with partial pivoting; both are overwritten."""
+    """Solution (n,) of A x = b by Gaussian elimination; both are overwritten."""
     n = len(b)
     for i in range(n):
         pivot = i
@@ -178,7 +172,7 @@ def exponential(twist, T):
 
 @scalar
 def hypothesis(draw, found, T):
-    """Write the motion (4, 4) of three correspondences, from the twist that is linear in their flow."""
+    """Write the motion (4, 4) of three correspondences, linear in their flow."""
     points, targets, i = found.points, found.targets, found.intrinsics
     A, b = np.zeros((6, 6)), np.empty(6)
     for k in range(3):
@@ -200,7 +194,7 @@ def hypothesis(draw, found, T):
 
 @scalar
 def refine(T, found, inlier_px):
-    """Replace a motion (4, 4) by the least-squares motion of its inliers, with errors below ``inlier_px``."""
+    """Replace a motion (4, 4) by the least-squares motion of its inliers."""
     for scale in ROUNDS:
         H, gradient, inliers = linearized(T, found, scale * inlier_px)
         if inliers < 6:
@@ -221,8 +215,7 @@ def refine(T, found, inlier_px):
 
 @scalar
 def score(start, stop, motions, found, params, scores):
-    """MSAC scores (g, k) of the motions ``start`` to ``stop`` at each noise level (Torr and Zisserman 2000), times a
-    prior.
+    """MSAC scores (g, k) of motions at each noise level (Torr and Zisserman 2000), times a prior.
 
     gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)), with the reprojection
     error e_n and the mean distance d of the pixels from the expected ones.
@@ -252,11 +245,10 @@ def score(start, stop, motions, found, params, scores):
 
 @scalar
 def linearized(T, found, inlier_px):
-    """Normal equations of the reprojection error at a motion (4, 4), without errors of ``inlier_px`` or more.
+    """Normal equations of the reprojection error at a motion (4, 4), of errors below ``inlier_px``.
 
     Returns:
-        H (6, 6) and gradient (6,), number of inliers. ``solve(H, gradient)`` is the twist (v, omega) of the update
-        exp(twist) @ T.
+        H (6, 6), gradient (6,), number of inliers. ``solve(H, gradient)`` is the twist (v, omega) of exp(twist) @ T.
     """
     points, targets, intrinsics = found.points, found.targets, found.intrinsics
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]

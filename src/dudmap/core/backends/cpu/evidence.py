@@ -1,7 +1,4 @@
-"""Evidence of motion at single pixels, in two compiled calls: residual statistics, and moving pixels.
-
-The formulas come first: arithmetic on numbers or images.
-"""
+"""Evidence of motion at pixels: residual statistics, and moving pixels; the formulas come first."""
 
 from typing import Any, NamedTuple
 
@@ -18,9 +15,9 @@ MAX_RESIDUAL = 16.0
 EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
 CENTERS = (EDGES[:-1] + EDGES[1:]) / 2
 LARGEST = np.float32(MAX_RESIDUAL - 1e-3)
-"""Value to which larger residuals are clipped."""
+"""Clip of larger residuals."""
 BINS_PER_SIGMA = np.float32(BINS / MAX_RESIDUAL)
-"""Bins per standard deviation of the depth."""
+"""Bins per standard deviation."""
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
@@ -29,10 +26,9 @@ class NoiseParameters(NamedTuple):
 
     Attributes:
         base, scale: Sensor noise, sigma(z) = base + scale z^2 (thesis eq. 3.91), metres and 1/m.
-        map_variance: Variance of the map's surface, m^2.
-        edge_sigmas, edge_slope: Largest depth step to a neighbour of the same surface: standard deviations, and share
-            of the depth.
-        floor, sigmas: As for ``noise_limit``.
+        map_variance: Of the map's surface, m^2.
+        edge_sigmas, edge_slope: Largest depth step within a surface: standard deviations, share of the depth.
+        floor, sigmas: See ``noise_limit``.
     """
 
     base: float
@@ -59,10 +55,10 @@ class RegionRules(NamedTuple):
 
     Attributes:
         limit: Log odds of a certain pixel.
-        coupling, sweeps: As for ``labeling.mean_field``.
-        half_seam: Half width of seams that are not seeds, pixels.
-        min_area: Smallest number of pixels of a region.
-        seeded_share: Smallest share of seeds in a region.
+        coupling, sweeps: See ``labeling.mean_field``.
+        half_seam: Half width of seams, which are no seeds, pixels.
+        min_area: Smallest region, pixels.
+        seeded_share: Smallest share of seeds.
     """
 
     limit: float
@@ -79,36 +75,36 @@ exact_sigma = written_out(reading_sigma)
 
 @exact_scalar
 def static_sigma(sigma: Any, map_variance: Any) -> Any:
-    """Standard deviation of the distance of a static point, metres, from depth noise ``sigma`` and map noise."""
+    """Standard deviation of a static point's distance, metres."""
     return np.sqrt(sigma * sigma + map_variance)
 
 
 @exact_scalar
 def edge_tolerance(sigma: Any, z: Any, edge_sigmas: Any, edge_slope: Any) -> Any:
-    """Largest depth step to a neighbour of the same surface, metres."""
+    """Largest depth step within a surface, metres."""
     return edge_sigmas * sigma + edge_slope * z
 
 
 @exact_scalar
 def mixture_log_odds(square: Any, offset: Any, slope: Any) -> Any:
-    """Log odds static : dynamic of a squared normalised residual under two half-normal densities (thesis eq. 4.56)."""
+    """Log odds static : dynamic of a squared normalised residual (thesis eq. 4.56)."""
     return np.float32(offset + square * slope)
 
 
 @exact_scalar
 def noise_limit(sigma: Any, floor: Any, sigmas: Any) -> Any:
-    """Smallest distance to the map that counts as motion (theta in eq. 4.57), metres."""
+    """Smallest distance that counts as motion (theta in eq. 4.57), metres."""
     return np.maximum(floor, sigmas * sigma)
 
 
 @exact_scalar
 def surface_log_odds(distance, sigma, noise, offset, slope, limit):
-    """Log odds static : dynamic at a surface of the map, at least 1 within the noise (eq. 4.57).
+    """Log odds static : dynamic at a map surface, at least 1 within the noise (eq. 4.57).
 
     Args:
-        distance, sigma: Distance to the map and its standard deviation, metres.
-        noise: Smallest distance that counts as motion, metres.
-        offset, slope: As for ``mixture_log_odds``.
+        distance, sigma: Metres.
+        noise: Smallest distance of motion, metres.
+        offset, slope: See ``mixture_log_odds``.
         limit: Log odds of a certain pixel.
     """
     residual = abs(distance) / sigma
@@ -118,20 +114,19 @@ def surface_log_odds(distance, sigma, noise, offset, slope, limit):
 
 @exact
 def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tolerance, histogram):
-    """Noise of the pixels of an image, and the mixture of their residuals.
+    """Noise of an image's pixels, and the mixture of their residuals.
 
     Args:
-        distance, occupancy: (h, w) of the map at the points of the image, see ``MapSample``.
+        distance, occupancy: (h, w), see ``MapSample``.
         noise: NoiseParameters, all float32.
         rules: MixtureRules.
-        centers: (BINS,) float64, centres of the histogram bins.
-        sigma: (h, w) float32 out, standard deviation of the distance of a static point, metres.
-        tolerance: (h, w) float32 out, largest depth step to a neighbour of the same surface, metres.
-        histogram: (BINS,) int64 out, counts of the normalised residuals at the surfaces of the map; initially 0.
+        centers: (BINS,) float64.
+        sigma: (h, w) float32 out, standard deviation of a static distance, metres.
+        tolerance: (h, w) float32 out, largest depth step within a surface, metres.
+        histogram: (BINS,) int64 out, residuals at surfaces; initially 0.
 
     Returns:
-        Share of depth pixels in unknown space; prior of the dynamic density, standard deviations of the static and of
-        the dynamic density.
+        Share of depth in unknown space; prior of the dynamic density, standard deviations, static and dynamic.
     """
     h, w = depth.shape
     readings, unknown = 0, 0
@@ -155,21 +150,20 @@ def weigh_readings(depth, distance, occupancy, noise, rules, centers, sigma, tol
 def moving_pixels(
     depth, distance, occupancy, sigma, tolerance, added, offset, slope, noise, rules, dynamic, seeds, probability
 ):  # fmt: skip
-    """Pixels that move, alone or in regions that grow from them over the surface.
+    """Pixels that move, alone or in regions.
 
-    1. Compute the log odds static : dynamic of each pixel, 0 = unknown (eq. 4.56, 4.57), and their mean field.
-    2. Seeds are the dynamic pixels except thin seams along depth edges; dynamic pixels in free space are always seeds.
-    3. Regions grow from seeds up to depth edges and up to pixels with log odds of at least 1. Small regions and regions
-    with few seeds are static.
+    1. Log odds static : dynamic of each pixel, 0 = unknown (eq. 4.56, 4.57), and mean field.
+    2. Seeds: dynamic pixels in free space, or outside thin seams along depth edges.
+    3. Regions grow from seeds up to depth edges and log odds of 1; small ones and ones with few seeds are static.
 
     Args:
         depth, distance, occupancy, sigma, tolerance: As for ``weigh_readings``.
-        added: (h, w) float32, further log odds moving : static; of size 0 for none.
-        offset, slope: Float64 and float32, as in ``Mixture.coefficients``.
+        added: (h, w) float32, further log odds moving : static; size 0 for none.
+        offset, slope: Float64 and float32, see ``Mixture.coefficients``.
         noise: NoiseParameters, all float32.
         rules: RegionRules.
         dynamic, seeds: (h, w) bool out.
-        probability: (h, w) float32 out, static probability of the mean field.
+        probability: (h, w) float32 out, static.
     """
     h, w = depth.shape
     limit = np.float32(rules.limit)

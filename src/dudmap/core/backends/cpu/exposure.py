@@ -1,4 +1,4 @@
-"""Robust fit of gain and offset between the intensities of an image and of the map."""
+"""Robust fit of gain and offset between image and map intensities."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,11 +7,11 @@ from dudmap.core.backends.median import nth
 from dudmap.core.backends.threads import scalar
 
 LARGE_GAIN = 1.25
-"""A gain beyond this factor, up or down, is a change of the light."""
+"""Larger gains, up or down, are changes of the light."""
 FEWEST = 100
-"""Smallest number of pixels for a fit."""
+"""Fewest pixels of a fit."""
 LOWEST, HIGHEST = 0.5 / 255, 254.5 / 255
-"""Intensities between which an 8-bit image is not saturated."""
+"""Unsaturated intensities of 8 bits."""
 
 
 @scalar
@@ -21,18 +21,16 @@ def fit_exposure(
     weights: NDArray[np.float32],
     ceiling: float = HIGHEST,
 ) -> tuple[float, float]:
-    """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit without
-    saturated pixels.
+    """Gain and offset with ``gain * intensity + offset`` closest to the map's, robust, without saturated pixels.
 
-    A change of the median or the contrast by more than LARGE_GAIN makes the fit unreliable. Its prior outweighs a dark
-    image, and misaligned pixels flatten it. A second candidate then comes from the quartiles of both images, corrected
-    by a second fit if that correction is below LARGE_GAIN. The smaller median error wins.
+    If median or contrast change by more than LARGE_GAIN, a second candidate comes from the quartiles, corrected by a
+    second fit below LARGE_GAIN; the smaller median error wins. The smaller median error wins.
 
     Args:
         intensity: (h, w) float32 of the image.
         difference: (h, w) float32 map minus image, NaN off the map.
         weights: (h, w) static weights.
-        ceiling: Intensity at which a channel of the image saturates.
+        ceiling: Saturation of a channel.
     """
     h, w = intensity.shape
     used, count = np.empty(h * w, np.int32), 0
@@ -72,7 +70,6 @@ def fit_exposure(
 
 @scalar
 def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """One robust fit of ``gain * x + offset`` to y (n,), with a prior of the gain at 1."""
     middle, count = len(x) // 2, len(x)
     errors = y - x
     gain, offset = 1.0, nth(errors, middle)

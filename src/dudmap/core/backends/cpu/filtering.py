@@ -1,7 +1,7 @@
-"""Loops over one image: depth limits, hole filling, depth-adaptive bilateral filter, intensities, halving.
+"""Loops over one image: depth limits, holes, bilateral filter, intensities, halving.
 
-Rows are sliced before the inner loop. An index that the compiler cannot prove positive needs Numba's wrap-around test,
-which prevents vectorisation (measured: a factor 4).
+Rows are sliced before inner loops, because Numba's wrap-around test of indices prevents vectorisation (measured: a
+factor 4).
 """
 
 import numpy as np
@@ -13,19 +13,19 @@ from dudmap.core.backends.threads import bands, kernel, run_bands, scalar, writt
 
 f32 = np.float32
 ABSENT = np.float32(-1e9)
-"""Filter depth of a pixel without measurement: so distant that its range weight vanishes."""
+"""Filter depth without measurement, of vanishing range weight."""
 OUTSIDE = np.float32(-2e9)
 """Filter depth of a pixel outside the image."""
 LONGEST_RUN = 3
-"""Longest run of missing pixels, in the row or the column, of a small hole."""
+"""Longest run of missing pixels of a small hole."""
 MIN_NEIGHBOURS = 8
-"""Smallest number of measurements in the 5x5 neighbourhood of a filled pixel."""
+"""Fewest measurements in the 5x5 neighbourhood of a filled pixel."""
 FILTER_ROWS = 120
 
 
 @kernel
 def limit_depth(depth, low, high, out):
-    """Keep depths of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
+    """Keep depths (H, W) float32 within [low, high] metres; others, also NaN, become 0."""
     source, target = depth.reshape(-1), out.reshape(-1)
     for n in range(source.size):
         z = source[n]
@@ -34,21 +34,19 @@ def limit_depth(depth, low, high, out):
 
 @scalar
 def between(z, a, b, gap):
-    """Whether a depth ``z`` lies between two others by more than ``gap`` of both; missing values give False."""
+    """Whether ``z`` lies between two depths by more than ``gap``; False with missing ones."""
     low, high = min(a, b), max(a, b)
     return (low > np.float32(0)) & (z > low + gap) & (z < high - gap)
 
 
 @kernel
 def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
-    """Remove flying pixels, which measure a depth between foreground and background; they become 0.
-
-    Such a pixel lies behind one neighbour and in front of the other, one or two pixels away in its row or column. Both
-    differences exceed ``max(noise_floor, noise z^2) + slope z``, which no measurable surface reaches.
+    """Remove flying pixels: one or two pixels away, in row or column, one neighbour is nearer and the opposite farther
+    by ``max(noise_floor, noise z^2) + slope z``, as on no measurable surface.
 
     Args:
         noise, noise_floor: Tolerance, 1/m and metres.
-        slope: Step per pixel of the steepest measurable surface, as a share of the depth.
+        slope: Step per pixel of the steepest surface, share of the depth.
         out: (H, W) float32 out.
     """
     h, w = depth.shape
@@ -74,11 +72,11 @@ def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
 
 @scalar
 def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
-    """Whether the run of missing pixels around a missing pixel is short and its two ends lie on one surface.
+    """Whether the run of missing pixels around one is short and ends on one surface.
 
     Args:
-        a1, a2, a3: Depths one, two and LONGEST_RUN = three pixels before it, 0 = none.
-        b1, b2, b3: Depths after it.
+        a1, a2, a3: Depths one to LONGEST_RUN pixels before, 0 = none.
+        b1, b2, b3: Depths after.
         slope, noise_floor: See ``fill_holes``.
     """
     zero, one, two, three = f32(0), f32(1), f32(2), f32(3)
@@ -94,15 +92,14 @@ def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
 
 @kernel
 def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
-    """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
+    """Give pixels of small holes the mean of valid 5x5 neighbours (thesis section 4.3), without bridging depth edges.
 
-    A missing pixel is filled if its run of missing pixels, in the row or the column, is at most LONGEST_RUN long and
-    ends on one surface. Its 5x5 neighbourhood must have at least MIN_NEIGHBOURS measurements within ``max(noise_floor,
-    slope z^2)``. Depth edges are thus not bridged, and large holes keep their border.
+    A run of missing pixels, in row or column, is at most LONGEST_RUN long and ends on one surface. At least
+    MIN_NEIGHBOURS measurements of 5x5 lie within ``max(noise_floor, slope z^2)``.
 
     Args:
         slope: Largest depth range over squared depth, 1/m.
-        noise_floor: Largest depth range near the camera, metres.
+        noise_floor: Largest range near the camera, metres.
         out: (H, W) float32 out.
     """
     wide_vectors()
@@ -149,10 +146,8 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
 
 @scalar
 def range_weight(difference, inverse):
-    """Weight (1 - d^2 inverse)^8 of a depth difference d, 0 beyond d^2 inverse = 1; ``inverse`` = 1 / (16 sigma_c^2).
-
-    Approximates the Gaussian exp(-d^2 / (2 sigma_c^2)) by arithmetic that vectorises.
-    """
+    """Weight (1 - d^2 inverse)^8 of a depth difference d, 0 beyond d^2 inverse = 1: a Gaussian by arithmetic that
+    vectorises; ``inverse`` = 1 / (16 sigma_c^2)."""
     w = max(np.float32(1) - difference * difference * inverse, np.float32(0))
     w = w * w
     w = w * w
@@ -161,11 +156,6 @@ def range_weight(difference, inverse):
 
 @scalar
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
-    """Add one tap on each side of every pixel of a line to the sums of the filter, or none if one lies outside.
-
-    The sum over opposite taps is independent of the surface slope; a single tap would bias slanted surfaces at the
-    border.
-    """
     for u in range(middle.size):
         z, scale = middle[u], inverse[u]
         d, e = before[u] - z, after[u] - z
@@ -177,7 +167,6 @@ def _accumulate(middle, before, after, inverse, spatial, numerator, denominator)
 
 @scalar
 def _start(middle, alpha, inverse, numerator, denominator):
-    """Sums of the filter with the centre tap alone, and 1 / (16 sigma_c^2) of each pixel."""
     for u in range(middle.size):
         z = middle[u]
         sigma = max(alpha * z * z, np.float32(1e-4))
@@ -190,10 +179,10 @@ def _start(middle, alpha, inverse, numerator, denominator):
 def bilateral(row_start, row_stop, padded, alpha, spatial, out):
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: columns first, then rows.
 
-    Unlike the thesis, taps whose opposite lies outside the image are omitted (``_accumulate``).
+    Taps whose opposite lies outside the image are omitted, because one alone would bias slanted surfaces.
 
     Args:
-        padded: (H + 2r, W + 2r) float32, metres, ABSENT = no measurement, OUTSIDE in the border of r pixels.
+        padded: (H + 2r, W + 2r) float32, metres, ABSENT = none, OUTSIDE in the border.
         alpha: sigma_c over squared depth, 1/m.
         spatial: (r + 1,) float32 weights by pixel distance.
         out: (H, W) float32 out; 0 = no measurement.
@@ -225,7 +214,7 @@ def bilateral(row_start, row_stop, padded, alpha, spatial, out):
 
 @kernel
 def pad(row_start, row_stop, depth, margin, out):
-    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for missing depth."""
+    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for none."""
     w = depth.shape[1]
     for v in range(row_start, row_stop):
         source, target = depth[v], out[v + margin][margin : margin + w]
@@ -273,10 +262,7 @@ def foreground_mean(a, b, c, d, band, least):
 
 @kernel
 def halve_depth(row_start, row_stop, depth, band, least, out):
-    """Mean of the depths of each 2x2 block within ``band max(least, z)`` behind its nearest depth z.
-
-    Foreground and background are never mixed; a block without depth gives 0.
-    """
+    """Mean of the depths of each 2x2 block within ``band max(least, z)`` behind the nearest depth z; 0 without."""
     for v in range(row_start, row_stop):
         upper, lower, target = depth[2 * v], depth[2 * v + 1], out[v]
         for u in range(target.size):
@@ -286,10 +272,10 @@ def halve_depth(row_start, row_stop, depth, band, least, out):
 
 
 def filter_depth(depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
-    """Depth (H, W) in metres, limited, with small holes filled, and smoothed (thesis section 4.3).
+    """Depth (H, W) in metres, limited, filled and smoothed (thesis section 4.3).
 
     Args:
-        depth: (H, W) float32, metres; NaN and values outside the limits count as missing.
+        depth: (H, W) float32, metres; NaN and others outside the limits are missing.
         parameters: Limits and filter.
     """
     p, (height, width), ranges = parameters, depth.shape, bands(depth.shape[0], FILTER_ROWS)
@@ -319,10 +305,8 @@ def intensity(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def halve(
     depth: NDArray[np.float32], intensity: NDArray[np.float32], band: float, least: float = 1.0
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth and intensity (H // 2, W // 2): means over 2x2 blocks.
-
-    Depth is averaged within ``band max(least, z)`` behind the nearest depth z.
-    """
+    """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, depth within ``band max(least, z)`` behind the
+    nearest z."""
     small_depth, small_intensity = np.empty((2, depth.shape[0] // 2, depth.shape[1] // 2), dtype=np.float32)
     halve_depth(0, len(small_depth), depth, np.float32(band), np.float32(least), small_depth)
     halve_intensity(0, len(small_intensity), intensity, small_intensity)

@@ -1,6 +1,6 @@
-"""Fusion of a depth image in two compiled calls: the blocks that it touches, and averaging into the blocks in view.
+"""Fusion of a depth image: blocks that it touches, for which the map allocates voxels, and averaging.
 
-Between them the map allocates voxels. Threads share the ``BANDS`` bands of each step (``teams.py``).
+Threads share ``BANDS`` bands per step (``teams.py``).
 """
 
 import numpy as np
@@ -14,20 +14,19 @@ from dudmap.core.backends.parameters import BLOCK, SensorNoise, single
 from dudmap.core.backends.threads import kernel, scalar
 
 BANDS = 16
-"""Bands of a step; their load varies less than with one band per thread."""
+"""Bands of a step."""
 MAX_FOUND = 1 << 16
-"""Largest number of cells that one band may find."""
+"""Cells that one band may find."""
 FRONTAL_WEIGHT = np.float32(4)
-"""Weight at normal incidence and the reference depth, if weighted by angle and noise: four steps down to 1."""
+"""Weight at normal incidence and reference depth, by angle and noise."""
 LEAST_DEPTH = 0.05
-"""Smallest value of the largest depth in ``pixel_step``, metres."""
+"""Smallest largest depth in ``pixel_step``, metres."""
 
 
 def reading_weights(
     depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise
 ) -> NDArray[np.uint8]:
-    """Weight (H, W) of each pixel: cos(theta) / sigma(z) (eq. 4.20), ``FRONTAL_WEIGHT`` at normal incidence and the
-    reference depth."""
+    """Weight (H, W): cos(theta) / sigma(z) (eq. 4.20), ``FRONTAL_WEIGHT`` at normal incidence and reference depth."""
     weights = np.ones(depth.shape, dtype=np.uint8)
     observation_weights(0, len(depth), depth, intrinsics, single(noise), FRONTAL_WEIGHT, weights)
     return weights
@@ -35,7 +34,7 @@ def reading_weights(
 
 @scalar
 def part(size, band):
-    """First element of a band if ``size`` elements are divided evenly."""
+    """First of ``size`` elements of a band."""
     return size * band // BANDS
 
 
@@ -44,20 +43,20 @@ def touch(
     leads, team, image, used, given, T_blocks_camera, intrinsics, shape, window, free_count, free_after, frame_number,
     stamps, p, depth, nearest, farthest, valid, weights, found, counts, largest,
 ):  # fmt: skip
-    """Prepare an image for fusion, and find the window cells without voxels that its truncation bands touch.
+    """Prepare an image, and find window cells without voxels that its bands touch.
 
     Args:
         image: (H, W) float32, metres, 0 = none.
         used: (H, W) bool, pixels to fuse.
-        given: Whether ``weights`` is input; otherwise it is computed.
+        given: Whether ``weights`` is input, else output.
         T_blocks_camera: (3, 4) float32, camera to window blocks.
-        shape, window, free_count, free_after, frame_number, stamps: As for ``mark_blocks``.
+        shape, window, free_count, free_after, frame_number, stamps: See ``mark_blocks``.
         p: FusionParameters.
-        depth: (H, W) float32 out, the used depths.
+        depth: (H, W) float32 out, used depths.
         nearest, farthest, valid: Depth tiles out, see ``tile_ranges``.
         weights: (H, W) uint8 in or out.
-        found: (BANDS, n) int32 out, cells; ``counts`` (BANDS,) int64 out, number of cells of each band.
-        largest: (BANDS,) float32 out, largest depth of each band, metres.
+        found: (BANDS, n) int32 out, cells; ``counts`` (BANDS,) int64 out.
+        largest: (BANDS,) float32 out, metres.
     """
     wide_vectors()
     h, tiles = image.shape[0], nearest.shape[0]
@@ -94,7 +93,7 @@ def touch(
 
 @scalar
 def pixel_step(largest, fx, block_size):
-    """Stride of the pixels that mark blocks: half a block at the largest depth, 1 to 8 pixels."""
+    """Stride of pixels that mark blocks: half a block at the largest depth, 1 to 8."""
     farthest = LEAST_DEPTH
     for band in range(BANDS):
         farthest = max(farthest, np.float64(largest[band]))
@@ -107,22 +106,22 @@ def fuse(
     farthest, valid, pixels, words, geometry, colors, parameters, parity, window, shape, origin, free_count,
     free_after, slots, repeats, visible, occupied, found, counts,
 ):  # fmt: skip
-    """Average an image into the blocks in view, and observe free space in every second plane of the window.
+    """Average an image into the blocks in view, and observe free space in every second plane.
 
     Args:
         candidates, fused, turn: As for ``visible_slots``.
-        count: Number of equal frames that this frame stands for.
-        averages: Whether to fuse; otherwise the blocks in view are only found.
+        count: Equal frames that this one stands for.
+        averages: Whether to fuse, or only to find blocks in view.
         T, intrinsics, size, coords: As for ``visible_slots``.
         nearest, farthest, valid: Depth tiles, see ``tile_ranges``.
-        depth, rgb, weights, pixels: As for ``pack_pixels``; ``words`` is the flat view of ``pixels``.
+        depth, rgb, weights, pixels: See ``pack_pixels``; ``words`` is flat ``pixels``.
         geometry, colors, parameters: As for ``integrate_blocks``.
         parity: First visited plane; negative = none.
         window, shape, origin, free_count, free_after: As for ``observe_free``.
-        slots, repeats: (n,) int32 and float32 out, blocks in view, and number of frames that this frame stands for.
-        visible: (BANDS + 1,) int64 out, blocks in view per band, and their total.
+        slots, repeats: (n,) int32 and float32 out, blocks in view, frames that this one stands for.
+        visible: (BANDS + 1,) int64 out, blocks in view per band, and total.
         occupied: (n,) int32 out, see ``integrate_blocks``.
-        found: (BANDS, n) int32 out, empty cells without an entry; ``counts`` (BANDS,) int64 out.
+        found: (BANDS, n) int32 out, empty cells without entry; ``counts`` (BANDS,) int64 out.
     """
     wide_vectors()
     block_size = np.float32(BLOCK) * parameters.voxel_size
@@ -165,7 +164,7 @@ def fuse(
 
 @scalar
 def joined(size, count, slots, repeats, visible):
-    """Move the results of all bands together, in their order; multiply the frames by ``count``. Returns the total."""
+    """Join the results of all bands in order; multiply frames by ``count``; returns the total."""
     total = 0
     for band in range(BANDS):
         first = part(size, band)
@@ -178,7 +177,7 @@ def joined(size, count, slots, repeats, visible):
 
 @scalar
 def farthest_tile(nearest):
-    """Largest finite depth of the tiles; nothing beyond lies in front of all surfaces."""
+    """Largest finite depth of the tiles."""
     largest = np.float32(0)
     for z in nearest.flat:
         if np.isfinite(z):

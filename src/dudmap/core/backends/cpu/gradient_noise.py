@@ -1,4 +1,4 @@
-"""Image sums for the noise of the gradients in the normal equations (``core/tracking/observability.py``)."""
+"""Image sums of gradient noise in the normal equations (``core/tracking/observability.py``)."""
 
 import numpy as np
 
@@ -7,10 +7,9 @@ from dudmap.core.formulas.pixel import sigma
 from dudmap.core.formulas.residual import weigh
 
 NUM_MOMENTS = 10
-"""Sums of w, w x, w y, w z, w xx, w xy, w xz, w yy, w yz and w zz over points."""
+"""Sums of w, w x, w y, w z, w xx, w xy, w xz, w yy, w yz, w zz over points."""
 NUM_SUMS = 3 + 2 * NUM_MOMENTS
-"""Number of pixels on the map, sum of their depths, sum of their distance weights; moments of the noise of distances
-and of intensities."""
+"""Pixels on the map, sums of depths and distance weights; moments of the noise of distances and intensities."""
 
 
 @scalar
@@ -18,19 +17,18 @@ def noise_sums(
     stride, depth, residuals, weights, intrinsics, parameters, filter_px, scale_px, voxel_size, interpolated, steepest,
     sums,
 ):  # fmt: skip
-    """Add the gradient noise of every ``stride``-th pixel, in rows and columns, to ``sums``.
+    """Add the gradient noise of every ``stride``-th pixel, across and down, to ``sums``.
 
     Args:
-        stride: Pixels.
         residuals: (h, w) float32 distances and (h, w) float32 intensity differences, NaN off the map.
-        weights: (h, w) float32 static weights.
+        weights: (h, w) float32.
         parameters: RegistrationParameters.
         filter_px: Standard deviation of the depth filter, pixels of this image.
-        scale_px: Pixels of this image per pixel of the images fused into the map.
+        scale_px: Pixels per pixel of the fused images.
         voxel_size: Metres.
-        interpolated: Variance of a gradient component of the trilinear interpolation of independent values.
-        steepest: Largest tangent of the angle of incidence.
-        sums: (NUM_SUMS,) float64 in and out; points about the camera's centre, camera axes.
+        interpolated: Gradient variance of interpolated independent values.
+        steepest: Tangent of the largest angle of incidence.
+        sums: (NUM_SUMS,) float64 in and out, about the camera's centre, camera axes.
     """
     height, width = depth.shape
     distances, differences = residuals
@@ -71,13 +69,13 @@ def noise_sums(
 
 @scalar
 def isotropic(moments, R, share, regular, out):
-    """Sum of w J' J with J = [I, -hat(p)] over rotated points, from the moments of ``noise_sums``.
+    """Sum of w J' J, J = [I, -hat(p)], over rotated points, from moments.
 
     Args:
         moments: (NUM_MOMENTS,) float64.
         R: (3, 3) float64.
-        share: Factor of the result.
-        regular: Share by which the diagonal is raised, because collinear points leave one rotation undetermined.
+        share: Factor.
+        regular: Increase of the diagonal, for collinear points.
         out: (6, 6) float64 out.
     """
     second = np.empty((3, 3))
@@ -109,17 +107,16 @@ def isotropic(moments, R, share, regular, out):
 def noise_information(
     stride, depth, residuals, weights, intrinsics, parameters, numbers, R, of_intensity, regular, H, least, sums, out
 ):  # fmt: skip
-    """Sums of ``noise_sums``, and the information (2, 6, 6) that the noise of distances and of intensities adds to H.
-
-    Returns whether H minus ``least`` times the noise information is positive definite.
+    """Sums of ``noise_sums``, and information (2, 6, 6) of the noise; returns whether H minus ``least`` times it is
+    positive definite.
 
     Args:
         stride, depth, residuals, weights, intrinsics, parameters, sums: As for ``noise_sums``.
-        numbers: The other arguments of ``noise_sums``.
+        numbers: Other arguments of ``noise_sums``.
         R: (3, 3) float64, camera to world.
-        of_intensity: Variance of a component of the intensity gradient.
+        of_intensity: Variance of an intensity gradient component.
         regular: As for ``isotropic``.
-        H: (6, 6) normal equations of both terms, world axes.
+        H: (6, 6) of both terms, world axes.
         least: Factor of the noise.
         out: (2, 6, 6) float64 out.
     """

@@ -1,7 +1,6 @@
 """Hash table from block coordinates to map entries (thesis eq. 4.48; Teschner et al. 2003, Niessner et al. 2013).
 
-Open addressing with linear probing; a cell holds an entry's number or -1. Entries are never removed: free space keeps
-its entry without voxels.
+Open addressing with linear probing; a cell holds an entry or -1; entries are never removed.
 """
 
 import numpy as np
@@ -13,16 +12,13 @@ EMPTY = -1
 
 @scalar
 def _cell(x, y, z, size):
-    """First cell of block (x, y, z): the thesis' hash, mixed by Knuth's multiplicative method and scaled to the
-    table.
-    """
     mixed = ((x * 73856093) ^ (y * 19349669) ^ (z * 83492791)) * np.int64(-7046029254386353131)
     return (((mixed >> 32) & 0xFFFFFFFF) * size) >> 32
 
 
 @scalar
 def place_of(table, coords, x, y, z):
-    """Cell of the table that holds the entry of block (x, y, z), or the free cell for it."""
+    """Cell of block (x, y, z)'s entry, or the free cell for it."""
     cell = _cell(x, y, z, table.size)
     while table[cell] != EMPTY:
         entry = table[cell]
@@ -43,10 +39,8 @@ def find_all(table, coords, wanted):
 
 @kernel
 def insert_all(table, coords, num_entries, wanted):
-    """Entries (n,) int32 of blocks ``wanted`` (n, 3) and the new number of entries; unknown blocks are added.
-
-    ``table`` and ``coords`` must have room for all of them.
-    """
+    """Entries (n,) int32 of blocks ``wanted`` (n, 3), added if unknown, and the number of entries; arrays must have
+    room."""
     out = np.empty(len(wanted), np.int32)
     for n in range(len(wanted)):
         x, y, z = np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2])
@@ -79,15 +73,12 @@ def in_use(slots, entry_of):
 
 @kernel
 def fill_window(window, origin, coords, slot_of, num_entries, inside):
-    """Write every entry inside the window: its voxel slot, or ``-2 - entry`` without voxels.
+    """Write every entry inside the window: slot, or ``-2 - entry``. Returns the slots' number.
 
     Args:
-        window, origin: (Wx, Wy, Wz) int32 in and out, and (3,) int64 coordinates of its first block.
+        window, origin: (Wx, Wy, Wz) int32 in and out, (3,) int64 first block.
         coords, slot_of, num_entries: The entries.
-        inside: (num_entries,) int32 out, the slots in the window.
-
-    Returns:
-        Number of slots in the window.
+        inside: (num_entries,) int32 out, slots in the window.
     """
     count = 0
     for entry in range(num_entries):

@@ -11,11 +11,8 @@ from dudmap.core.formulas.voxel import fuse_color, fuse_voxel, is_occupied, pack
 
 @scalar
 def used_readings(row_start, row_stop, depth, used, farthest, out):
-    """Copy depths of ``depth`` (H, W) up to ``farthest`` metres at the pixels ``used`` (H, W) bool; the others become
-    0.
-
-    Returns the largest copied depth in rows ``row_start`` to ``row_stop``.
-    """
+    """Copy depths (H, W) up to ``farthest`` metres at ``used`` pixels (H, W) bool, else 0; returns the largest in these
+    rows."""
     largest = np.float32(0)
     for v in range(row_start, row_stop):
         source, chosen, target = depth[v], used[v], out[v]
@@ -29,15 +26,15 @@ def used_readings(row_start, row_stop, depth, used, farthest, out):
 
 @scalar
 def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
-    """Pack the fusion's input of each pixel into two words (``core/formulas/voxel.py``), to reduce loads.
+    """Pack each pixel's input into two words (``core/formulas/voxel.py``).
 
-    The free depth of a pixel is the nearest depth of its 3x3 neighbourhood minus the truncation band there.
+    Free depth is the nearest of 3x3 minus the truncation band there.
 
     Args:
         rgb: (H, W, 3) uint8.
-        weights: (H, W) uint8, weight of each pixel.
+        weights: (H, W) uint8.
         parameters: FusionParameters.
-        pixels: (H * W + 1, 2) int32 out; the last row does not change.
+        pixels: (H * W + 1, 2) int32 out, except the last row.
     """
     wide_vectors()
     h, w = depth.shape
@@ -72,14 +69,13 @@ def integrate_blocks(
 
     Args:
         slots: (n,) int32.
-        repeats: (n,) float32, number of frames that this frame stands for.
+        repeats: (n,) float32, frames that this one stands for.
         coords: (num_slots, 3) int32 relative to the origin of T.
         T: (3, 4) float32, world to camera.
-        pixels: (2 * (H * W + 1),) int32, the words of ``pack_pixels``.
+        pixels: (2 * (H * W + 1),) int32, see ``pack_pixels``.
         map_geometry, map_colors: (num_slots * 512,) int32, packed.
         parameters: FusionParameters.
-        occupied: (n,) int32 out: number of voxels that hold a surface or were never observed. For blocks that the image
-            does not change, 1 stands for any positive number.
+        occupied: (n,) int32 out: voxels with a surface or never observed; 1 = some, in unchanged blocks.
     """
     wide_vectors()
     voxel_size = parameters.voxel_size
@@ -170,13 +166,11 @@ def integrate_blocks(
 
 @scalar
 def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out):
-    """Weight of each pixel: cos(theta) / err(z) (eq. 4.20), scaled to ``best`` at normal incidence and the reference
-    depth.
+    """Weight of each pixel: cos(theta) / err(z) (eq. 4.20), ``best`` at normal incidence and reference depth.
 
     Args:
-        noise: SensorNoise, whose sigma(z) is err(z).
-        best: Weight at normal incidence and the reference depth.
-        out: (H, W) uint8 out, at least 1 for pixels with depth.
+        noise: SensorNoise; err(z) is sigma(z).
+        out: (H, W) uint8 out, at least 1 with depth.
     """
     wide_vectors()
     h, w = depth.shape

@@ -1,7 +1,4 @@
-"""Label images: mixture of residual densities, mean-field smoothing, region growing, upsampling to full resolution.
-
-The scalar formulas come first; the loops over histograms and images follow.
-"""
+"""Label images: mixture of residuals, mean field, region growing, upsampling; formulas come first."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,28 +9,27 @@ from dudmap.core.backends.threads import kernel, scalar
 f64, exp, sqrt = np.float64, np.exp, np.sqrt
 UPSAMPLING_BAND = 60
 DISTANCE_COST = np.float32(1e-4)
-"""Cost of a low-resolution pixel of image distance in the upsampling, metres: below the resolution of depth, so that
-it decides between equal depths only."""
+"""Cost per low-resolution pixel of distance in upsampling, metres: decides between equal depths."""
 SMALLEST = np.float64(1e-300)
-"""Smallest sum of two densities; keeps the quotient finite if both vanish."""
+"""Smallest sum of two densities."""
 MISSING_COST = np.float32(64)
-"""Cost of pairing a pixel with depth and a pixel without, metres: more than any depth difference."""
+"""Cost of pairing pixels with and without depth, metres."""
 
 
 @scalar
 def half_normal(square, prior, sigma):
-    """Density of a component of the mixture up to the common factor sqrt(2 / pi) (thesis eq. 4.56).
+    """Density of a component without sqrt(2 / pi) (thesis eq. 4.56).
 
     Args:
         square: Squared normalised residual.
-        prior, sigma: Prior and standard deviation of the component.
+        prior, sigma: Of the component.
     """
     return prior / sigma * exp(f64(-0.5) * square / (sigma * sigma))
 
 
 @scalar
 def dynamic_responsibility(square, prior, static, dynamic):
-    """Posterior probability that a residual belongs to the dynamic component (E-step; thesis eq. 4.53).
+    """Posterior of the dynamic component (E-step; thesis eq. 4.53).
 
     Args:
         square: Squared normalised residual.
@@ -47,10 +43,10 @@ def dynamic_responsibility(square, prior, static, dynamic):
 
 @scalar
 def bounded_sigma(squares, mass, low, high):
-    """Maximum-likelihood standard deviation of a half-normal density within bounds (M-step; thesis eq. 4.55).
+    """Maximum-likelihood half-normal standard deviation within bounds (M-step; thesis eq. 4.55).
 
     Args:
-        squares: Sum of the squared residuals, weighted by the responsibilities.
+        squares: Squared residuals times responsibilities.
         mass: Sum of the responsibilities.
         low, high: Bounds.
     """
@@ -59,7 +55,7 @@ def bounded_sigma(squares, mass, low, high):
 
 @scalar
 def tanh(x):
-    """Hyperbolic tangent for |x| <= 5 within 3e-4 (Lambert's continued fraction), in arithmetic that vectorises."""
+    """Hyperbolic tangent for |x| <= 5 within 3e-4 (Lambert's continued fraction), vectorisable."""
     square = x * x
     top = x * (np.float32(135135) + square * (np.float32(17325) + square * (np.float32(378) + square)))
     bottom = np.float32(135135) + square * (np.float32(62370) + square * (np.float32(3150) + square * np.float32(28)))
@@ -68,21 +64,20 @@ def tanh(x):
 
 @scalar
 def mean_spin(log_odds):
-    """Expectation of a spin (static = 1, dynamic = -1) with these log odds static : dynamic: tanh(log_odds / 2)."""
+    """Expected spin (static = 1, dynamic = -1) of log odds static : dynamic: tanh(log_odds / 2)."""
     return tanh(np.float32(0.5) * log_odds)
 
 
 @scalar
 def same_surface(z, z_neighbour, tolerance):
-    """Whether two neighbouring pixels both have depth, and depths that differ by at most ``tolerance``."""
+    """Whether two pixels have depths that differ by at most ``tolerance``."""
     zero = np.float32(0)
     return (z_neighbour > zero) & (z > zero) & (abs(z_neighbour - z) <= tolerance)
 
 
 @scalar
 def depth_cost(z, z_low):
-    """Cost of giving a full-resolution pixel of depth ``z`` a low-resolution label: depth difference, metres, or
-    ``MISSING_COST`` if only one has depth."""
+    """Cost of a low-resolution label for depth ``z``: difference, metres, or ``MISSING_COST``."""
     zero = np.float32(0)
     return abs(z_low - z) if (z > zero) == (z_low > zero) else MISSING_COST
 
@@ -93,16 +88,16 @@ def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds,
 
     Args:
         counts: (n,) float64.
-        centers: (n,) float64, normalised residuals.
-        iterations: Largest number of iterations.
-        start: Initial prior of the dynamic density, standard deviations of the static and of the dynamic density.
-        prior_bounds: Bounds of the prior of the dynamic density.
-        static_bounds: Bounds of the standard deviation of the static density.
-        separation: Smallest ratio of the standard deviations, dynamic : static.
-        max_sigma: Largest standard deviation of the dynamic density.
+        centers: (n,) float64.
+        iterations: Limit.
+        start: Prior of the dynamic density, standard deviations, static and dynamic.
+        prior_bounds: Of the dynamic prior.
+        static_bounds: Of the static standard deviation.
+        separation: Smallest ratio of standard deviations.
+        max_sigma: Largest dynamic standard deviation.
 
     Returns:
-        As ``start``, which is returned for an empty histogram.
+        As ``start``, which is returned without counts.
     """
     total = counts.sum()
     prior, static, dynamic = start
@@ -129,15 +124,15 @@ def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds,
 
 @scalar
 def grow_regions(seeds, open_pixels, depth, tolerance):
-    """Flood fill from seeds over open pixels that does not cross depth edges.
+    """Flood fill from seeds over open pixels within depth edges.
 
     Args:
         seeds: (h, w) bool.
-        open_pixels: (h, w) bool, pixels that a region may grow into.
-        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+        open_pixels: (h, w) bool.
+        tolerance: (h, w) float32, largest depth step within a surface, metres.
 
     Returns:
-        (h, w) int32 number of each pixel's region from 1, 0 = none, and the number of regions.
+        (h, w) int32 region from 1, 0 = none, and the number of regions.
     """
     h, w = depth.shape
     stack = np.empty(h * w, np.int32)
@@ -171,18 +166,18 @@ def grow_regions(seeds, open_pixels, depth, tolerance):
 
 @scalar
 def mean_field(evidence, depth, tolerance, coupling, iterations):
-    """Static probabilities with neighbourhood consistency (cliques of thesis algorithm 3), by mean-field iteration.
+    """Static probabilities with neighbourhood consistency (cliques of thesis algorithm 3), by mean field.
 
-    With the spin s = 1 for static and -1 for dynamic, each sweep sets the expectation of every spin to
+    Each sweep sets the expectation of every spin s (1 = static, -1 = dynamic) to
 
         <s_i> = tanh((e_i + coupling / 8 * sum_j <s_j>) / 2)
 
-    over the neighbours j among the 8 that lie on the same surface.
+    over the 8 neighbours j on the same surface.
 
     Args:
-        evidence: (h, w) float32 log odds static : dynamic of each pixel alone, at most 6; 0 = unknown.
-        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
-        coupling: Log odds that all neighbours together can add, at most 4.
+        evidence: (h, w) float32 log odds static : dynamic, at most 6; 0 = unknown.
+        tolerance: (h, w) float32, largest depth step within a surface, metres.
+        coupling: Log odds of all neighbours, at most 4.
         iterations: Sweeps.
 
     Returns:
@@ -223,15 +218,13 @@ def mean_field(evidence, depth, tolerance, coupling, iterations):
 def upsample_labels(
     low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32], stride: int
 ) -> NDArray[np.bool_]:
-    """Labels at full resolution: each pixel takes the label of the adjacent low-resolution pixel with the nearest
-    depth.
+    """Labels at full resolution, of the adjacent low-resolution pixel with the nearest depth.
 
     Args:
         low: (h, w) bool.
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
-        stride: Full-resolution pixels per low-resolution pixel k, which covers columns (and rows) k * stride to (k + 1)
-            * stride - 1.
+        stride: Full pixels per low pixel k, which covers columns (rows) k * stride to (k + 1) * stride - 1.
 
     Returns:
         (H, W) bool.
@@ -244,7 +237,7 @@ def upsample_labels(
 
 @kernel
 def upsample(leads, team, low, low_depth, depth, stride, out):
-    """Loop of ``upsample_labels`` for a team of threads (``teams.py``); ``low`` and ``out`` are uint8."""
+    """Loop of ``upsample_labels`` for a team of threads; ``low`` and ``out`` are uint8."""
     height = depth.shape[0]
     num_bands = -(-height // UPSAMPLING_BAND)
     band, _ = first_band(leads, team, 0, num_bands)
@@ -260,10 +253,7 @@ def upsample(leads, team, low, low_depth, depth, stride, out):
 
 @scalar
 def opened(mask, half):
-    """Morphological opening of a mask (h, w) bool with a square of 2 ``half`` + 1 pixels.
-
-    Pixels outside the image neither erode nor dilate.
-    """
+    """Opening of a mask (h, w) bool by a square of 2 ``half`` + 1 pixels, without pixels outside."""
     h, w = mask.shape
     across, out = np.empty((h, w), np.bool_), mask.copy()
     for turn in range(2):  # the outside is dilated, then the inside

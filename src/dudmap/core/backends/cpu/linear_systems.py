@@ -8,9 +8,9 @@ from dudmap.core.backends.threads import kernel
 
 
 def solved(H: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solution (n,) or (n, k) of ``H x = right`` with a symmetric positive definite H (n, n).
+    """Solution (n,) or (n, k) of ``H x = right``, H (n, n) symmetric positive definite.
 
-    A BLAS is not used, because its threads keep the cores of the tracking busy for 50 ms after every call.
+    No BLAS, whose threads keep the cores busy for 50 ms.
     """
     columns = np.array(right.T.reshape(-1, len(H)), order="C")
     solve(np.array(H, order="C"), columns)
@@ -19,7 +19,7 @@ def solved(H: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.flo
 
 @kernel
 def solve(H, columns):
-    """Replace each of the ``columns`` (k, n) by the solution, and H by its Cholesky factor."""
+    """Replace ``columns`` (k, n) by solutions, and H by its Cholesky factor."""
     wide_vectors()
     for i in range(len(H)):
         for j in range(i + 1):

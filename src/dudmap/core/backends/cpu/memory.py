@@ -8,15 +8,13 @@ from numba.extending import intrinsic
 from dudmap.core.backends.threads import scalar
 
 LINES = 16
-"""Cache lines per call of ``prefetch_quarter``: a quarter of a block. Most cores can have this many loads pending."""
+"""Cache lines per ``prefetch_quarter``: a quarter of a block. Most cores can load this many at once."""
 LINE = 64
 
 
 @intrinsic
 def load_pair(typing_context, words, index):
-    """Two consecutive elements of a flat int32 array, starting at ``index``, as one int64; the first is its lower
-    half.
-    """
+    """Elements ``index`` and next of a flat int32 array as one int64, the first lower."""
 
     def generate(context, builder, signature, arguments):
         pair = ir.IntType(64)
@@ -27,7 +25,7 @@ def load_pair(typing_context, words, index):
 
 @intrinsic
 def prefetch(typing_context, array, index):
-    """Prefetch the cache line of an element of a flat array: a hint that changes no result."""
+    """Prefetch the cache line of an element."""
 
     def generate(context, builder, signature, arguments):
         byte_pointer, number = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -50,6 +48,6 @@ def _place(context, builder, signature, arguments):
 
 @scalar
 def prefetch_quarter(words, index):
-    """Prefetch a quarter of a block of a flat array of 32-bit words, starting at an index."""
+    """Prefetch a quarter of a block of 32-bit words."""
     for line in range(LINES):
         prefetch(words, index + np.uintp(line * LINE // 4))

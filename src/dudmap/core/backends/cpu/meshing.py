@@ -1,9 +1,9 @@
 """Marching cubes over voxel blocks with shared vertices (Lorensen & Cline 1987; thesis section 4.5).
 
-A vertex belongs to its lattice edge, and an edge to the voxel at its lower end, so that every vertex exists once.
-Passes over the blocks: cases of the cells, vertices of each voxel, vertices, triangles.
+A vertex belongs to its edge, an edge to the voxel at its lower end. Passes over blocks: cases, vertices of voxels,
+vertices, triangles.
 
-The tables are arguments, because Numba freezes global arrays and its cache ignores their changes.
+Tables are arguments, because Numba freezes global arrays.
 """
 
 import numpy as np
@@ -21,8 +21,6 @@ BAND = 256
 
 @scalar
 def _corner_words(geometry, near, row, words):
-    """Words (9, 9, 9) of a block and one voxel beyond its upper sides; 0 without a block. Assigning arrays would
-    compile for seconds."""
     for m in range(8):
         dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
         slot = near[row, 13 + 9 * dx + 3 * dy + dz]
@@ -36,9 +34,7 @@ def _corner_words(geometry, near, row, words):
 
 @kernel
 def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count, cases):
-    """Case of each cell of blocks ``start`` to ``stop``; 0 without a surface or with an untrusted corner.
-
-    A distance jump above ``max_jump`` steps is an occlusion boundary, no surface.
+    """A distance jump above ``max_jump`` steps is an occlusion boundary, no surface.
 
     Returns:
         (stop - start,) int64 triangles per block.
@@ -85,7 +81,6 @@ def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count,
 
 @scalar
 def _edge(row, n, corner, near, row_of):
-    """Row and number in it of the voxel at a corner of cell ``n`` of the block in ``row``."""
     i, j, k = (n >> 6) + (corner >> 2), ((n >> 3) & 7) + ((corner >> 1) & 1), (n & 7) + (corner & 1)
     if (i | j | k) & 8:
         row = np.int64(row_of[near[row, 13 + 9 * (i >> 3) + 3 * (j >> 3) + (k >> 3)]])
@@ -94,7 +89,6 @@ def _edge(row, n, corner, near, row_of):
 
 @kernel
 def _mark_vertices(near, row_of, cases, triangle_count, triangles, flags, owned):
-    """Set bit ``axis`` of ``flags`` for each voxel whose edge along it carries a vertex; count vertices per block."""
     for row in range(len(cases)):
         for n in range(512):
             case = cases[row, n]
@@ -183,7 +177,7 @@ def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, b
 
 @kernel
 def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
-    """Copy shared vertices for each chunk; chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
+    """Copy shared vertices for each chunk c with faces ``begin[c]`` to ``begin[c + 1]``.
 
     Args:
         begin: (chunks + 1,) int64.
@@ -228,8 +222,8 @@ def extract_chunks(
         coords: (slots, 3) block coordinates.
         near: (n, 27) int32, see ``VoxelBlocks.neighbourhood``.
         parameters: Parameters of the extraction.
-        chunks: (n,) group of each block; -1 = it only provides border voxels.
-        covered: (n, 8) octants, number 4 dx + 2 dy + dz, whose cells are omitted; None = none.
+        chunks: (n,) group of each block; -1 = border only.
+        covered: (n, 8) octants, number 4 dx + 2 dy + dz, without cells; None = none.
     """
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")

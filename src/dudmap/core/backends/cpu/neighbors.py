@@ -1,7 +1,7 @@
-"""The eight voxels around points of the map, for trilinear interpolation.
+"""The eight voxels around points of the map.
 
-Two thirds of all points have their voxels in one block: four loads of two words. A branch would be mispredicted, so the
-other third of a row is listed and looked up afterwards. The voxels of later points are prefetched.
+Two thirds of all points have them in one block: four loads of two words. The others are listed and looked up
+afterwards, without branches. Later points are prefetched.
 """
 
 import numpy as np
@@ -17,8 +17,7 @@ def load_corners(window, geometry, cell, voxel, size_y, size_z, corners, u):
     """Load the words of the eight voxels around a point into ``corners[:, u]``, int32, corner 4 dx + 2 dy + dz; 0 =
     unknown.
 
-    ``cell`` and ``voxel`` identify the lower corner. Two axes, because one vector load of eight words would wait for
-    all stores.
+    ``cell``, ``voxel``: lower corner. Two axes, because a vector load would wait for all stores.
     """
     # 1 along the axes whose next voxel lies in the next block
     x, y, z = ((voxel >> 6) + 1) >> 3, (((voxel >> 3) & 7) + 1) >> 3, ((voxel & 7) + 1) >> 3
@@ -37,13 +36,13 @@ def _voxel(geometry, slot, voxel):
 
 @scalar
 def last_corner(shape):
-    """Largest x, y, z of a lattice point with eight voxels around it in a window of ``shape`` blocks, int32."""
+    """Largest x, y, z of a lattice point with eight voxels in a window of ``shape`` blocks, int32."""
     return np.int32(shape[0] * 8 - 2), np.int32(shape[1] * 8 - 2), np.int32(shape[2] * 8 - 2)
 
 
 @scalar
 def locate(x, y, z, last, size_y, size_z):
-    """Address, for ``load_row``, of the eight voxels around a point of the window's lattice, voxels.
+    """Address, for ``load_row``, of the eight voxels around a lattice point, voxels.
 
     Args:
         x, y, z: The point, float32.
@@ -51,8 +50,8 @@ def locate(x, y, z, last, size_y, size_z):
         size_y, size_z: Blocks of the window.
 
     Returns:
-        Cell; voxel; 1 if the eight voxels lie in several blocks, else 0; whether the point lies inside; fractions of
-        its coordinates. For a point outside, the other values belong to another point.
+        Cell; voxel; 1 if in several blocks, else 0; whether inside; fractions of the coordinates. Outside, the others
+        belong to another point.
     """
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
     jx, jy, jz = np.int32(lx), np.int32(ly), np.int32(lz)
@@ -72,9 +71,9 @@ def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
 
     Args:
         window, shape, geometry: See ``VoxelGrid``; ``geometry`` is flat.
-        cells: (w + AHEAD,) int32, cell of the window that holds the point; any cell after the last point.
-        voxels: (w + AHEAD,) int32, number within the block of the voxel at its lower corner.
-        crossing: (w,) int32, 1 if the eight voxels of a point lie in several blocks, else 0; 0 for unused points.
+        cells: (w + AHEAD,) int32, window cell of the point; any after the last.
+        voxels: (w + AHEAD,) int32, number in the block of its lower corner.
+        crossing: (w,) int32, 1 if in several blocks; 0 for unused points.
         outer: (w,) int32, work space.
         words: (8, >= w) int32 out, corner 4 dx + 2 dy + dz.
     """

@@ -1,4 +1,4 @@
-"""Distance field of a map with one or several voxel sizes, for rendering."""
+"""Distance field with one or several voxel sizes, for rendering."""
 
 from typing import NamedTuple
 
@@ -15,8 +15,8 @@ class FinerLevels(NamedTuple):
     """Finer levels of a map, larger voxels first.
 
     Attributes:
-        children: Per level (slots of the next coarser, 8) int32: slot of the block with half the voxel size in each
-            octant of a block, -1 = none. Slots beyond the last row have no children.
+        children: Per level (slots of the next coarser, 8) int32 slot in each octant, -1 = none, also beyond the last
+            row.
         geometry, colors: Per level (slots, 512) int32 packed voxels and colours.
     """
 
@@ -27,7 +27,7 @@ class FinerLevels(NamedTuple):
 
 @scalar
 def block_at(window, shape, children, level, i, j, k):
-    """Slot of the block of a level that holds voxel (i, j, k) of that level's lattice; negative = none."""
+    """Slot of a level's block with voxel (i, j, k); negative = none."""
     bits = level + 3
     bx, by, bz = i >> bits, j >> bits, k >> bits
     if bx < 0 or by < 0 or bz < 0 or bx >= shape[0] or by >= shape[1] or bz >= shape[2]:
@@ -42,11 +42,8 @@ def block_at(window, shape, children, level, i, j, k):
 
 @scalar
 def load(window, shape, children, voxels, level, x, y, z, corners):
-    """Load the words of a level's voxels around a point of the window's lattice into ``corners[:, 0]``, number 4 dx + 2
-    dy + dz, 0 = none.
-
-    Returns the position of the point between them, in [0, 1).
-    """
+    """Load a level's words around a lattice point into ``corners[:, 0]``, number 4 dx + 2 dy + dz, 0 = none; returns
+    its position between them, in [0, 1)."""
     scale = np.float32(1 << level)
     x, y, z = x * scale, y * scale, z * scale
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
@@ -74,10 +71,8 @@ def blend(values, ax, ay, az):
 
 @scalar
 def sample(window, shape, children, voxels, x, y, z, least, corners, values):
-    """Signed distance in stored steps at lattice point (x, y, z) inside the window, and its level; NaN if unknown.
-
-    The smallest known voxels are used.
-    """
+    """Signed distance in steps at lattice point (x, y, z) by the smallest known voxels, and its level; NaN if
+    unknown."""
     for above in range(len(voxels)):
         level = len(voxels) - 1 - above
         if level > 0:
@@ -98,7 +93,7 @@ def sample(window, shape, children, voxels, x, y, z, least, corners, values):
 
 @written_out
 def corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz):
-    """Gradient of the trilinear interpolation of eight corners, 4 dx + 2 dy + dz, at (fx, fy, fz) in [0, 1]^3."""
+    """Gradient of trilinear interpolation of eight corners, 4 dx + 2 dy + dz, at (fx, fy, fz) in [0, 1]^3."""
     one = np.float32(1)
     wy, wz = one - fy, one - fz
     wx = one - fx

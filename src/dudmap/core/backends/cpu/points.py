@@ -1,4 +1,4 @@
-"""Trilinear samples of the whole map at any points, through the hash table; for tasks not done every frame."""
+"""Trilinear samples of the whole map at any points, through the hash table."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from dudmap.core.backends.cpu.hashing import place_of
 from dudmap.core.backends.threads import kernel
 
 UNSEEN, OBSERVED, EMPTY = 0, 1, 2
-"""State of a point: a voxel around it was never observed; all were observed; all lie in free blocks."""
+"""A voxel around a point was never observed; all were observed; all lie in free blocks."""
 SDF, WEIGHT, INTENSITY, RED = 0, 4, 5, 9
-"""First columns in the rows of ``sample_points``: distance (steps) and its gradient (per voxel), weight, intensity
-and its gradient, colour (quarters of a grey level)."""
+"""First columns of ``sample_points``: distance (steps) and gradient (per voxel), weight, intensity and gradient, colour
+(quarters of a grey level)."""
 COLUMNS = 12
 
 
@@ -17,13 +17,11 @@ COLUMNS = 12
 def sample_points(table, coords, slot_of, free_count, geometry, colors, points, motion, free_steps, free_weight):
     """Samples (n, COLUMNS) float32 and states (n,) uint8 of a map at points (n, 3), in voxels.
 
-    - The points are first moved by a rigid motion (3, 4).
-    - Distance and intensity are interpolated trilinearly, with gradients.
-    - The intensity is 0 if one of the eight voxels has none.
-    - The colour is interpolated among the voxels that have one, and 0 without any.
-    - The weight is the smallest of the eight voxels.
-    - A block without voxels, observed as empty k times, has the distance ``free_steps`` and the weight ``k
-      free_weight``.
+    - Points are first moved by a motion (3, 4).
+    - Distance and intensity are trilinear, with gradients; the intensity is 0 if a voxel has none.
+    - Colour is of the voxels that have one, else 0.
+    - Weight is the smallest.
+    - A block without voxels, empty k times, has ``free_steps`` and ``k free_weight``.
     """
     out = np.zeros((len(points), 12), np.float32)
     states = np.zeros(len(points), np.uint8)

@@ -1,7 +1,6 @@
-"""Rendering of the map at a pose: sphere tracing of the signed distance field (thesis eq. 4.12 and section 4.5).
+"""Rendering of the map: sphere tracing (thesis eq. 4.12 and section 4.5).
 
-Blocks are first splatted into tiles with the depth range of possible surfaces (Prisacariu et al. 2017), which bounds
-each ray.
+Blocks are splatted into tiles with depth ranges (Prisacariu et al. 2017), which bound each ray.
 """
 
 import numpy as np
@@ -17,7 +16,7 @@ TILE = 8
 BAND = 16
 INFINITE = np.float32(1e9)
 FAR = np.float32(2)
-"""Distance from the surface, voxels, beyond which the nearest voxel's value is used."""
+"""Distance from the surface, voxels, beyond which the nearest voxel's value suffices."""
 
 
 @kernel
@@ -73,28 +72,22 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
 
 @scalar
 def step_length(distance):
-    """Step along a ray, voxels, at a signed distance (voxels).
-
-    It is shorter than the distance, because a projective distance is an upper bound, but long enough that the tracing
-    does not stall.
-    """
+    """Step along a ray, voxels, at a signed distance (voxels): shorter, because a projective distance is an upper
+    bound."""
     ahead, back = max(np.float32(0.8) * distance, np.float32(0.5)), max(np.float32(-0.8) * distance, np.float32(1))
     return ahead if distance > np.float32(0) else back
 
 
 @scalar
 def to_block_boundary(p, d, inverse):
-    """Ray parameter from ``p`` to the boundary of its block along one axis."""
+    """Ray parameter from ``p`` to its block's boundary along an axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
     return (block + np.float32(8) - p) * inverse if d >= np.float32(0) else (block - p) * inverse
 
 
 @kernel
 def inside_window(shape, o, d, t, end, nudge):
-    """Part of the ray ``o + t d`` between ``t`` and ``end`` inside the window, without its last voxels and ``nudge``.
-
-    An empty part ends before its beginning.
-    """
+    """Part of the ray ``o + t d`` in the window, without last voxels and ``nudge``."""
     zero = np.float32(0)
     for axis in range(3):
         last = np.float32(8 * shape[axis] - 1)
@@ -108,9 +101,7 @@ def inside_window(shape, o, d, t, end, nudge):
 
 @scalar
 def _trace_ray(window, shape, children, voxels, o, d, t, end, unit, least, corners, values):
-    """First crossing from outside to inside along lattice ray ``o + t d`` between ``t`` and ``end``; -1 = none.
-
-    Far from the surface the nearest voxel gives the step; the field is interpolated only within FAR of it.
+    """First crossing to the inside along lattice ray ``o + t d``; -1 = none. The field is interpolated only within FAR.
 
     Args:
         window: (Wx * Wy * Wz,) int32; blocks with negative entries are skipped.
@@ -172,10 +163,6 @@ def _trace_ray(window, shape, children, voxels, o, d, t, end, unit, least, corne
 
 @scalar
 def _refine(window, shape, children, voxels, o, d, ends, unit, least, corners, values):
-    """Zero between two depths by false position (Illinois variant).
-
-    ``ends`` are depth and distance outside, and depth and distance inside.
-    """
     a, at_a, b, at_b = ends
     side = 0
     t = a + (b - a) * at_a / (at_a - at_b)
@@ -201,9 +188,6 @@ def _refine(window, shape, children, voxels, o, d, ends, unit, least, corners, v
 
 @scalar
 def _shade(window, shape, children, voxels, colors, x, y, z, least, corners, values, color, normal):
-    """Colour (3,) uint8 and normal (3,) float32 at a lattice point on the surface; normal 0 if the gradient
-    vanishes.
-    """
     one, level = np.float32(1), 0
     if len(voxels) > 1:
         _, level = sample(window, shape, children, voxels, x, y, z, least, corners, values)
@@ -229,11 +213,10 @@ def trace_rows(
     row_start, row_stop, window, shape, children, voxels, colors, intrinsics, T, near, far, depth_min, depth_max, unit,
     least, depth, color, normals,
 ):  # fmt: skip
-    """Render pixel rows ``row_start`` to ``row_stop`` of a view of the map.
+    """Render rows of a view.
 
-    ``voxels`` and ``colors`` hold the words (slots * 512,) int32 of each level, larger voxels first. ``children`` links
-    each level to the next (``FinerLevels``). ``T`` (3, 4) float32 maps metres in the camera frame to the lattice of the
-    window.
+    ``voxels``, ``colors``: (slots * 512,) int32 per level, larger voxels first; ``children`` links levels
+    (``FinerLevels``); ``T``: (3, 4) float32, metres in the camera frame to the window's lattice.
     """
     corners = np.empty((8, 1), np.int32)
     values = np.empty(8, np.float32)
@@ -270,11 +253,10 @@ def raycast(
     parameters: RaycastParameters,
     finer: FinerLevels,
 ) -> RaycastResult:
-    """Depth, colour and normals of the first surface at each pixel of an image (H, W).
+    """Depth, colour and normals of the first surface at each pixel (H, W): a change of the distance from positive to
+    negative between trusted voxels, not from unknown space.
 
-    A surface is a change of the signed distance from positive to negative between trusted voxels. A ray from unknown
-    space into the inside hits none. ``grid`` holds the largest of several voxel sizes; the smallest known voxels are
-    used.
+    ``grid``: largest voxel size; the smallest known voxels are used.
     """
     grid = grid.on_host()
     shape = grid.shape
@@ -306,7 +288,7 @@ def tile_depths(
     low: np.float32,
     high: np.float32,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Nearest and farthest depth at which each tile of an image may meet a block, between ``low`` and ``high``, m."""
+    """Nearest and farthest depth at which each tile may meet a block, between ``low`` and ``high``, m."""
     to_camera, _, radius = motions(grid, T_world_camera)
     tiles = (-(-size[0] // TILE), -(-size[1] // TILE))
     window = np.asarray(grid.window).reshape(tuple(grid.shape))
@@ -328,8 +310,8 @@ def tile_depths(
 def motions(
     grid: VoxelGrid, T_world_camera: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], np.float32]:
-    """Motions (3, 4) from blocks of the window to metres in the camera frame, and from there to the window's
-    lattice; radius of the sphere around a block, metres."""
+    """Motions (3, 4) window blocks to metres in the camera frame, and from there to the lattice; radius around a block,
+    metres."""
     voxel_size = grid.voxel_size
     corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]

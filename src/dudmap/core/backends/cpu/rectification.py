@@ -8,7 +8,7 @@ from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.threads import kernel, scalar
 
 SAME_SURFACE = np.float32(0.03)
-"""Largest difference, as a share of the depth, of depths that belong to one surface and are interpolated."""
+"""Largest depth difference on one surface, share of the depth."""
 
 
 @scalar
@@ -47,20 +47,20 @@ def rectify_rows(start, stop, depth, intrinsics, projection, fallback, size, wor
 
 @kernel
 def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, words, out, colors, sources):
-    """Depth, and colours, of each pixel at the time of the middle row, for a team of threads (``teams.py``).
+    """Depth and colours at the time of the middle row, for a team of threads.
 
-    A rectified pixel shows the recorded pixel to which its point moves until that row is read out. The point takes the
-    depth recorded at its own position.
+    A rectified pixel shows the recorded pixel to which its point moves; the point has the depth recorded at its own
+    position.
 
     Args:
         rows: Rows of a band.
-        projection: ColorProjection of the depth camera into itself, with identity ``place``.
-        fallback: Float32, depth of rows without any depth, metres.
+        projection: ColorProjection of the depth camera into itself, identity ``place``.
+        fallback: Float32, depth of empty rows, metres.
         size: H, H, W.
-        words: (H * W,) int32 of the colours recorded at the same pixels; of size 0 if unused.
-        out: (H, W) float32 out, metres; interpolated on a surface, otherwise from the nearest pixel.
-        colors: (H, W, 3) uint8 out, interpolated; of size 0 if unused.
-        sources: (H, W) int32 out, index of the nearest recorded pixel.
+        words: (H * W,) int32 colours; size 0 if unused.
+        out: (H, W) float32 out, metres, interpolated on a surface.
+        colors: (H, W, 3) uint8 out, interpolated; size 0 if unused.
+        sources: (H, W) int32 out, nearest recorded pixel.
     """
     wide_vectors()
     num_bands = -(-depth.shape[0] // rows)
@@ -77,8 +77,8 @@ def rectify(leads, team, rows, depth, intrinsics, projection, fallback, size, wo
 
 @kernel
 def recorded_mask(mask, sources, out):
-    """Mask (H, W) bool of a rectified image in the geometry of the recorded one, into ``out``. A displacement is
-    approximated by the negative one at the same rectified pixel, which differs by less than a pixel."""
+    """Mask (H, W) bool of a rectified image in the recorded geometry, into ``out``, by negative displacements, within a
+    pixel."""
     h, w = np.int32(mask.shape[0]), np.int32(mask.shape[1])
     flat, by_width, places = mask.reshape(-1), 1 / np.float64(w), np.empty(w, np.int32)
     for v in range(np.int32(0), h):

@@ -1,6 +1,6 @@
-"""Loops over blocks of one level of the map: detail of the surface, and initial values of finer blocks.
+"""Loops over a map level's blocks: surface detail, and initial values of finer blocks.
 
-A block is read with two voxels around it, from its 27 neighbours (``VoxelBlocks.neighbourhood``).
+Blocks are read with two voxels around (``VoxelBlocks.neighbourhood``).
 """
 
 import numpy as np
@@ -13,18 +13,18 @@ from dudmap.core.formulas.voxel import intensity_of, pack_color, pack_voxel, sdf
 PAD = 2
 SIZE = 8 + 2 * PAD
 NEAR = np.float32(1)
-"""Largest distance from the surface, voxels, at which the field is examined."""
+"""Distance from the surface, voxels, within which the field is examined."""
 SATURATED = np.float32(0.85)
-"""Share of the truncation band beyond which a distance may be truncated."""
+"""Share of the truncation band beyond which distances may be truncated."""
 PRIOR = 8
-"""Largest weight that a voxel inherits: two frontal measurements at one metre."""
+"""Weight that a voxel inherits: two frontal measurements at one metre."""
 BAND = 64
 
 
 @scalar
 def distance_bend(word, a, b, by_voxel, saturated):
-    """Second derivative of the distance at a voxel, per voxel, from the voxels two steps before and behind it, and
-    whether it is known; see ``examine_range``."""
+    """Second derivative of the distance, per voxel, from voxels two steps away, and whether known; see
+    ``examine_range``."""
     f, fa, fb = sdf_steps(word) * by_voxel, sdf_steps(a) * by_voxel, sdf_steps(b) * by_voxel
     known = ((a & 0xFF00) != 0) & ((b & 0xFF00) != 0) & (fa < saturated) & (fb < saturated)
     return (fa - f - f + fb) * np.float32(0.25), known
@@ -32,21 +32,21 @@ def distance_bend(word, a, b, by_voxel, saturated):
 
 @scalar
 def intensity_bend(word, a, b):
-    """Second derivative of the intensity (0..1) at a voxel from its neighbours, and whether it is known."""
+    """Second derivative of the intensity (0..1), and whether known."""
     known = ((a & 0xFF) != 0) & ((b & 0xFF) != 0) & ((word & 0xFF) != 0)
     return (intensity_of(a) + intensity_of(b) - np.float32(2) * intensity_of(word)) / np.float32(255), known
 
 
 @scalar
 def root_mean(total, count):
-    """Root mean square of ``count`` numbers from the sum of their squares."""
+    """Root mean square from a sum of squares."""
     return np.sqrt(total / np.float32(max(count, 1)))
 
 
 @scalar
 def mean_voxel(steps, count, weight, shade, shades):
-    """Word of the mean of ``count`` voxels from the sums of their distances and of ``shades`` intensities; 0 =
-    unknown, if the smallest weight is 0."""
+    """Word of the mean of ``count`` voxels from sums of distances and ``shades`` intensities; 0 = unknown, if the
+    weight is 0."""
     by = np.float32(1) / np.float32(max(shades, 1))
     word = pack_voxel(steps / np.float32(count), np.float32(weight), shade * by)
     return np.int32(word) if weight > 0 else np.int32(0)
@@ -54,7 +54,7 @@ def mean_voxel(steps, count, weight, shade, shades):
 
 @scalar
 def mean_color(red, green, blue, count):
-    """Word of the mean of ``count`` colours from their sums; 0 = none."""
+    """Word of the mean of ``count`` colours; 0 = none."""
     by = np.float32(1) / np.float32(max(count, 1))
     word = pack_color(red * by, green * by, blue * by)
     return np.int32(word) if count > 0 else np.int32(0)
@@ -62,12 +62,11 @@ def mean_color(red, green, blue, count):
 
 @kernel
 def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
-    """Octants of blocks ``start`` to ``stop``; the other arguments and results as for ``examine``.
+    """Octants of blocks ``start`` to ``stop``, see ``examine``.
 
     With the distance f in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
-    a. Steps of two voxels divide the noise by four. On a surface of curvature k the sum over the axes is about k times
-    the voxel size. The error of linear interpolation is an eighth of it. The bend is the root mean square of |D| over
-    the voxels near the surface. The texture is the same for the intensity, with steps of one voxel.
+    a, about curvature times voxel size in sum. Linear interpolation errs by an eighth; the bend is the root mean square
+    of |D| near the surface, the texture the same of intensity with steps of one voxel.
     """
     words = np.empty((SIZE, SIZE, SIZE), np.int32)
     flat = words.reshape(-1)
@@ -161,17 +160,17 @@ def prolong_range(start, stop, geometry, colors, near, octants, slots, fine_geom
 def examine(
     geometry: NDArray[np.int32], near: NDArray[np.int32], by_voxel: float, saturated: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Bend of distance and intensity near the surface, for each octant of blocks.
+    """Bend of distance and intensity near the surface, per octant.
 
     Args:
         geometry: (slots, 512) int32 voxels of one level.
-        near: (n, 27) int32 slots of the blocks and their neighbours, -1 = none.
-        by_voxel: Voxels per step of the stored distance.
-        saturated: Distance beyond which it may be truncated, voxels.
+        near: (n, 27) int32 slots, -1 = none.
+        by_voxel: Voxels per step.
+        saturated: Distance of possible truncation, voxels.
 
     Returns:
-        (n, 8) each: bend of the distance, per voxel, and of the intensity (0..1), float32, and whether the surface
-            passes through the octant or touches it, uint8.
+        (n, 8) each: bend of distance, per voxel, and of intensity (0..1), float32; whether the surface is in the octant
+        or touches it, uint8.
     """
     bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
     surface = np.empty((len(near), 8), dtype=np.uint8)
@@ -192,15 +191,14 @@ def prolong(
     fine_geometry: NDArray[np.int32],
     fine_colors: NDArray[np.int32],
 ) -> None:
-    """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
-
-    A voxel is known if all coarse voxels around it are known. Its weight is their smallest weight, at most PRIOR.
+    """Fill blocks of half the voxel size by trilinear interpolation; a voxel is known if all around are, with their
+    smallest weight, at most PRIOR.
 
     Args:
         geometry, colors: (coarse slots, 512) int32.
-        near: (n, 27) int32 coarse slots around the parent of each block, -1 = none.
-        octants: (n,) octant of the parent.
-        slots: (n,) int32 slots of the blocks.
+        near: (n, 27) int32 coarse slots around each parent, -1 = none.
+        octants: (n,) of the parent.
+        slots: (n,) int32.
         fine_geometry, fine_colors: (fine slots, 512) int32, changed here.
     """
     prolong_range(0, len(slots), geometry, colors, near, octants, slots, fine_geometry, fine_colors)

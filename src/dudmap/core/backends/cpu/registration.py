@@ -1,7 +1,7 @@
-"""Direct SDF and intensity registration (thesis eq. 4.27-4.47): one linearisation, and the descent of a level.
+"""Direct SDF and intensity registration (thesis eq. 4.27-4.47): a linearisation, and a level's descent.
 
-A row is processed in three stages: arithmetic for addresses, loads of eight voxels into buffers, arithmetic for
-residuals and sums. No stage mixes loads and branches, so that LLVM vectorises the first and the last.
+Rows are processed in stages: addresses, loads of eight voxels into buffers, residuals and sums. LLVM vectorises the
+first and last, free of loads and branches.
 """
 
 import numpy as np
@@ -18,11 +18,11 @@ from dudmap.core.formulas.residual import normal_terms, trilinear, weigh, within
 from dudmap.core.formulas.voxel import intensity_of, sdf_steps
 
 NUM_SUMS = 32
-"""Sums of one linearisation: 21 of H, 6 of b, cost, number of pixels on the map, weight of all pixels with depth,
-weight of the pixels on the map, weighted squared distances."""
+"""Sums of a linearisation: 21 of H, 6 of b, cost, pixels on the map, weight of all pixels with depth, weight on the
+map, weighted squared distances."""
 
 SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
-"""Index of each element of H among the sums, which hold its upper triangle row by row."""
+"""Index of each element of H among the sums (upper triangle by rows)."""
 SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
 
 COST = 27
@@ -30,9 +30,7 @@ COST = 27
 
 @scalar
 def write_lattice(T, voxel_size, origin, out):
-    """Write ``to_lattice`` of a pose (4, 4), element by element, because an array assignment takes a second to
-    compile.
-    """
+    """Write ``to_lattice`` of a pose (4, 4) by elements; an array assignment compiles for a second."""
     for i in range(3):
         for j in range(4):
             shift = np.float64(origin[i] * BLOCK) if j == 3 else np.float64(0)
@@ -44,15 +42,14 @@ def linearize_rows(
     row_start, row_stop, depth, intensity, weights, intrinsics, T, window, shape, geometry, voxel_size, sdf_unit,
     parameters, residuals, sums,
 ):  # fmt: skip
-    """Add the normal equations of pixel rows ``row_start`` to ``row_stop`` to ``sums`` and write their residuals.
+    """Add the normal equations of pixel rows to ``sums`` and write residuals.
 
     Args:
         depth, intensity, weights, intrinsics: See ``LevelImage``.
         T: (3, 4) float32, camera to the window's lattice, see ``to_lattice``.
         window, shape, geometry, voxel_size, sdf_unit: See ``VoxelGrid``; ``geometry`` is flat.
         parameters: RegistrationParameters.
-        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN off the map or without
-            weight.
+        residuals: (2, h, w) float32 out: signed distance (m), intensity difference; NaN off the map or without weight.
         sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
     """
     wide_vectors()
@@ -199,26 +196,26 @@ def descend(
     leads, team, rows, depth, intensity, weights, intrinsics, window, shape, origin, geometry, voxel_size, sdf_unit,
     parameters, T_first, is_known, first, rules, poses, buffers, residuals, sums,
 ):  # fmt: skip
-    """Levenberg-Marquardt steps of a level (the loop of ``descent.py``), for a team of threads (``teams.py``).
+    """Levenberg-Marquardt steps of a level (the loop of ``descent.py``), for a team of threads.
 
     Args:
-        leads, team: As for ``run_team``; each step of the team is one linearisation.
+        leads, team: See ``run_team``; a step is a linearisation.
         rows: Image rows of a band.
         depth, intensity, weights, intrinsics, window, shape, geometry, parameters: As for ``linearize_rows``.
-        origin: (3,) int64 coordinates of the window's first block.
-        voxel_size, sdf_unit: As for ``linearize_rows``, but float64.
-        T_first: (4, 4) first pose, camera to world.
-        is_known: Whether ``first`` holds the sums at this pose; otherwise they are computed first.
-        first: (NUM_SUMS,) float64, changed here.
+        origin: (3,) int64 first block.
+        voxel_size, sdf_unit: Float64.
+        T_first: (4, 4) camera to world.
+        is_known: Whether ``first`` holds the sums at this pose.
+        first: (NUM_SUMS,) float64, changed.
         rules: DescentRules.
-        poses: (limit + 1, 3, 4) float32 out, pose of each linearisation in the window's lattice.
-        buffers: (limit + 1,) int64 out, which of two buffers each linearisation writes.
-        residuals: (2, 2, h, w) float32 out, two buffers of residuals.
-        sums: (2, bands, NUM_SUMS) float64 out, two buffers of sums.
+        poses: (limit + 1, 3, 4) float32 out, lattice pose of each linearisation.
+        buffers: (limit + 1,) int64 out, buffer of each linearisation.
+        residuals: (2, 2, h, w) float32 out, two buffers.
+        sums: (2, bands, NUM_SUMS) float64 out, two buffers.
 
     Returns:
-        The last accepted pose (4, 4), its sums (NUM_SUMS,), the buffer of its residuals (-1 for known sums at the first
-        pose), the number of linearisations, and whether a stop criterion was met.
+        The last accepted pose (4, 4), its sums (NUM_SUMS,), its buffer (-1 for known sums at the first pose),
+        linearisations, and whether a stop criterion was met.
     """
     wide_vectors()
     num_bands, height = sums.shape[1], depth.shape[0]

@@ -1,4 +1,4 @@
-"""Reprojection of an image into older images of the same camera, and their agreement."""
+"""Reprojection of an image into older ones of one camera, and their agreement."""
 
 from typing import NamedTuple
 
@@ -14,18 +14,18 @@ from dudmap.core.backends.threads import exact, kernel, scalar
 NEAREST = np.float32(0.05)
 """Smallest depth of a projected point, metres."""
 LEAST_WEIGHT = np.float32(0.25)
-"""Smallest sum of the bilinear weights of the pixels with depth: the weight of each at equal distance."""
+"""Smallest sum of bilinear weights of pixels with depth."""
 PARTS = 2
 
 
 class Reprojection(NamedTuple):
-    """Differences of an image to n older frames, at the pixels of the image.
+    """Differences to n older frames, at the image's pixels.
 
     Attributes:
-        gap: (n, h, w) float32, metres: older depth minus depth of this image's point in the older camera. Of the four
-            pixels around the projection, the smallest magnitude counts; NaN = none.
-        difference: (n, h, w) float32, older minus this intensity, NaN = none.
-        marks: (n, h, w) uint8, mark of the selected older pixel, 0 if the point projects outside the older frame.
+        gap: (n, h, w) float32, metres: older depth minus depth of the point in the older camera, smallest of four
+            pixels; NaN = none.
+        difference: (n, h, w) float32, older minus this intensity; NaN = none.
+        marks: (n, h, w) uint8, of the selected older pixel, 0 outside.
     """
 
     gap: NDArray[np.float32]
@@ -46,9 +46,9 @@ def reproject(
     Args:
         depth, intensity: (h, w) float32; depth in metres, 0 = none.
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        Ts_older_camera: (n, 4, 4), camera of the image to the cameras of the older frames.
-        older: (n, 2, h, w) float32, depth and intensity of the older frames.
-        marks: (n, h, w) uint8, marks of their pixels.
+        Ts_older_camera: (n, 4, 4), image to older cameras.
+        older: (n, 2, h, w) float32, depth and intensity.
+        marks: (n, h, w) uint8.
     """
     shape, Ts = marks.shape, Ts_older_camera.astype(np.float32)
     gap, difference = np.empty((2, *shape), np.float32)
@@ -79,7 +79,7 @@ def reproject_all(leads, team, depth, intensity, intrinsics, Ts, older, old_mark
 def reproject_rows(
     start, stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
 ):  # fmt: skip
-    """Differences of some rows to one older frame; ``T`` is (4, 4) float32, the last three arguments are output."""
+    """Differences of some rows to an older frame; ``T``: (4, 4) float32; the last three arguments are output."""
     h, w = depth.shape
     zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
@@ -136,26 +136,26 @@ def reproject_rows(
 
 
 AGREEING_SIGMAS = 3 * np.sqrt(2)
-"""Largest difference of two depths of one surface that noise explains, in standard deviations of one of them."""
+"""Largest difference of two depths of one surface, standard deviations."""
 ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
 @exact
 def compare_images(depth, intensity, moving, gap, difference, marks, noise, fewest, ceilings):
-    """Displacement between two images, and number of pixels with equal depth.
+    """Displacement between two images, and pixels of equal depth.
 
     Args:
-        moving: (h, w) bool, pixels that move.
-        gap, difference, marks: Differences to the older image, see ``Reprojection``; marks are its moving pixels.
+        moving: (h, w) bool.
+        gap, difference, marks: See ``Reprojection``; marks are moving pixels.
         noise: NoiseParameters, all float32.
-        fewest: Smallest number of pixels that show the same static surface in both.
-        ceilings: Saturation limits of this and the older image.
+        fewest: Pixels of the same static surface.
+        ceilings: Saturation limits, this and older.
 
     Returns:
-        - Displacement, see ``ImageConsistency.compare``, pixels; NaN with too few common or unsaturated pixels.
-        - Number of depths that agree within AGREEING_SIGMAS.
-        - Number of all depths.
-        - Number of depths at whose position the older image has depth.
+        - Displacement, see ``ImageConsistency.compare``, pixels; NaN with too few pixels.
+        - Depths that agree within AGREEING_SIGMAS.
+        - All depths.
+        - Depths with depth in the older image.
     """
     h, w = depth.shape
     agreeing, readings, seen, count = 0, 0, 0, 0

@@ -1,7 +1,7 @@
-"""Lossless compression of depth images by run lengths and variable-length differences (RVL; Wilson 2017).
+"""Lossless compression of depth by run lengths and differences (RVL; Wilson 2017).
 
-Runs: number of zeros, number of other values, and these as differences to the previous value. Numbers are groups of
-three bits, lowest first, with a fourth bit for continuation; eight groups make a word of 32 bits, highest first.
+Runs: number of zeros, number of others, and these as differences to the previous. Numbers are groups of three bits,
+lowest first, with a continuation bit; eight groups make a 32-bit word, highest first.
 """
 
 import struct
@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel, scalar
 
 HEADER = struct.Struct("<II")
-"""Columns and rows before the words, in the layout of ROS' compressed_depth_image_transport."""
+"""Columns and rows before the words, as ROS' compressed_depth_image_transport."""
 MOST_PIXELS = 1 << 26
-"""Largest accepted number of pixels, because a few bytes can encode a long run of zeros."""
+"""Largest number of pixels: a few bytes encode many zeros."""
 
 
 @scalar
 def _put(value, words, place):
-    """Write a number from group ``place`` into words that are 0; returns the next place."""
     while True:
         group = value & 7
         value >>= 3
@@ -32,7 +31,6 @@ def _put(value, words, place):
 
 @scalar
 def _get(words, place, last):
-    """A number, and the next place; beyond ``last`` if the words end within the number."""
     value, shift = np.int64(0), 0
     while place < last:
         group = np.int64((words[place >> 3] >> np.uint32(28 - 4 * (place & 7))) & np.uint32(15))
@@ -45,7 +43,7 @@ def _get(words, place, last):
 
 @kernel
 def encode(image, words):
-    """Compress an image (n,) uint16 into words (n + 1,) uint32 that are 0; returns the number of used words."""
+    """Compress (n,) uint16 into words (n + 1,) uint32 of 0; returns the used words."""
     n, place, before, number = image.size, 0, np.int64(0), 0
     while number < n:
         start = number
@@ -64,7 +62,7 @@ def encode(image, words):
 
 @kernel
 def decode(words, image):
-    """Restore an image (n,) uint16 from words uint32; returns whether the words are valid."""
+    """Restore (n,) uint16 from uint32 words; returns whether valid."""
     n, place, last, before, number = image.size, 0, 8 * words.size, np.int64(0), 0
     while number < n:
         zeros, place = _get(words, place, last)

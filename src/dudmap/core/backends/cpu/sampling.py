@@ -1,4 +1,4 @@
-"""Loop over the points of a depth image: signed distance, intensity difference and occupancy of the map."""
+"""Signed distance, intensity difference and occupancy of the map at a depth image's points."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ f32, f64 = np.float32, np.float64
 
 @scalar
 def corner_weight(k, ax, ay, az):
-    """Trilinear weight, float64, of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3."""
+    """Trilinear weight of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3, float64."""
     one = f64(1)
     x, y, z = f64(ax), f64(ay), f64(az)
     return (x if k >> 2 != 0 else one - x) * (y if (k >> 1) & 1 != 0 else one - y) * (z if k & 1 != 0 else one - z)
@@ -26,16 +26,14 @@ def sample_rows(
     row_start, row_stop, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
     distance, difference, occupancy,
 ):  # fmt: skip
-    """Sample the map at the points of pixel rows ``row_start`` to ``row_stop``.
-
-    Unobserved corners are omitted from the interpolation; a point needs half of the weight. A row is processed in
-    stages, see ``registration.py``.
+    """Sample the map at the points of pixel rows; known corners need half of the weight. Rows are in stages, see
+    ``registration.py``.
 
     Args:
         depth, intensity, intrinsics: See ``LevelImage``.
         T: (3, 4) float32, camera to the window's lattice, voxels.
         window, shape, geometry, sdf_unit, free_count: See ``VoxelGrid``; ``geometry`` is flat.
-        free_after: Observations that make free space.
+        free_after: Observations of free space.
         distance, difference, occupancy: Out, see ``MapSample``.
     """
     wide_vectors()
@@ -86,10 +84,7 @@ def sample(
     leads, team, rows, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
     distance, difference, occupancy,
 ):  # fmt: skip
-    """Sample the map at the points of an image, with ``rows`` rows per band, for a team of threads (``teams.py``).
-
-    Other arguments as for ``sample_rows``.
-    """
+    """``sample_rows`` of an image, ``rows`` per band, for a team of threads."""
     wide_vectors()
     height = depth.shape[0]
     num_bands = -(-height // rows)

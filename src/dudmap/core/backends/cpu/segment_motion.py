@@ -1,4 +1,4 @@
-"""Motion of whole segments, and segments that are still at their place in an older frame."""
+"""Motion of whole segments, and segments still at their place in an older frame."""
 
 from typing import NamedTuple
 
@@ -10,48 +10,43 @@ from dudmap.core.backends.parameters import SURFACE, UNKNOWN
 from dudmap.core.backends.threads import exact, exact_scalar
 
 MAX_SHARE = 0.15
-"""Largest share of the image of a movable segment. Larger ones belong to the room: dynamic only if nearly all of
-their pixels are."""
+"""Largest share of the image of a movable segment; larger ones need nearly all pixels dynamic."""
 MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
-"""Smallest share of dynamic pixels for a dynamic segment: with evidence that the others moved, and without."""
+"""Smallest dynamic share of a dynamic segment, with evidence of the others' motion, and without."""
 STARTED_SHARE = 0.1
-"""Smallest share of seeds in a segment whose pixels in unknown space move, and in a region grown from seeds."""
+"""Smallest share of seeds in a segment that moves in unknown space, and in a grown region."""
 DISTANCE_SCALE = 1.0
-"""Mean distance to the map of a segment that has moved, standard deviations of the depth."""
+"""Mean distance of a moved segment, standard deviations."""
 MISMATCH_SCALE = 1 / 3
-"""Intensity mismatch of a segment that has moved, pixels of motion at REFERENCE_WIDTH."""
+"""Intensity mismatch of a moved segment, pixels at REFERENCE_WIDTH."""
 COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
-"""Upper quartiles of both over the static segments of a well registered frame; larger ones scale the limits."""
+"""Upper quartiles of both over static segments; larger ones scale the limits."""
 GRADIENT_NOISE = 0.03
-"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH; smaller gradients give no evidence."""
+"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH."""
 SETTLED_SIGMAS = 4
-"""Distance between two measurements of a point beyond which it has moved, standard deviations."""
+"""Distance of a moved point, standard deviations."""
 LEAST_SHARE = np.float32(1e-3)
-"""Smallest share of compared pixels in a window; keeps a quotient finite."""
+"""Smallest compared share of a window."""
 SIZE, COMPARED, DYNAMIC, DISTANCE, MISMATCH = range(5)
-"""Columns of the evidence of a segment: number of pixels; share of compared pixels (a surface of map or older frame is
-near); share of dynamic pixels; mean of distance / sigma over the static compared pixels; their intensity mismatch,
-pixels of motion.
-
-The mismatch is D G / (G + noise)^2, with the mean absolute deviation D of the intensity difference and the mean
-gradient G.
-"""
+"""Evidence of a segment: pixels; compared share (a surface is near); dynamic share; mean distance / sigma of static
+compared pixels; their intensity mismatch D G / (G + noise)^2, pixels, with mean absolute deviation D of differences and
+mean gradient G."""
 MEAN_DEVIATION = 1.183
-"""Mean absolute deviation over median absolute deviation, for normally distributed values."""
+"""Mean over median absolute deviation of normal values."""
 f64 = np.float64
 
 
 class SegmentImage(NamedTuple):
-    """The segments of an image, and the scales of their residuals.
+    """The segments of an image, and scales of residuals.
 
     Attributes:
-        labels: (h, w) int32 numbers of the segments from 1, 0 = none.
+        labels: (h, w) int32 from 1, 0 = none.
         count: Number of segments.
-        min_pixels: Smallest number of pixels of a segment that is classified as a whole.
+        min_pixels: Smallest segment classified as a whole.
         gradient: (h, w) float32, magnitude of the intensity gradient.
-        window: Side of the window over which intensity differences are averaged, pixels, odd.
-        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        least_sigma: Float32, lower bound of ``sigma`` here.
+        window: Side of the averaging window, pixels, odd.
+        sigma: (h, w) float32, of a static distance, metres.
+        least_sigma: Float32, its lower bound.
     """
 
     labels: NDArray[np.int32]
@@ -65,7 +60,7 @@ class SegmentImage(NamedTuple):
 
 @exact_scalar
 def mirrored(n, size):
-    """Index of the mirror image of a pixel beyond the image border: 1 for -1."""
+    """Index of a pixel mirrored at the border: 1 for -1."""
     n = -n if n < 0 else n
     n = 2 * size - 2 - n if n >= size else n
     return min(max(n, 0), size - 1)
@@ -73,7 +68,7 @@ def mirrored(n, size):
 
 @exact_scalar
 def window_means(compared, difference, window):
-    """Mean difference (h, w) over the compared pixels of a square window."""
+    """Mean difference (h, w) over compared pixels of a square window."""
     h, w = compared.shape
     half, by_area = window // 2, 1.0 / (window * window)
     ones, sums, means = np.zeros((h, w)), np.zeros((h, w)), np.empty((h, w), np.float32)
@@ -103,14 +98,14 @@ def window_means(compared, difference, window):
 
 @exact_scalar
 def segment_evidence(segments, labels, count, compared, moving, distance, means):
-    """Evidence of motion (count + 1, 5) of each segment; row 0 is meaningless.
+    """Evidence (count + 1, 5) of each segment; row 0 has no meaning.
 
     Args:
         segments: SegmentImage.
         labels, count: Its labels, or others.
         compared, moving: (h, w) bool.
         distance: (h, w) float32, metres.
-        means: (h, w) float32, ``window_means`` of the intensity differences.
+        means: (h, w) float32, ``window_means``.
     """
     h, w = labels.shape
     sums, deviations, out = np.zeros((count + 1, 7)), np.zeros(count + 1), np.empty((count + 1, 5))
@@ -143,7 +138,7 @@ def segment_evidence(segments, labels, count, compared, moving, distance, means)
 
 @exact_scalar
 def upper_quartile(values):
-    """75th percentile of a few values, linearly interpolated; 0 without values. Sorts the values in place."""
+    """75th percentile of a few values, sorted in place; 0 without."""
     count = len(values)
     if count == 0:
         return 0.0
@@ -161,27 +156,23 @@ def upper_quartile(values):
 
 @exact_scalar
 def classify_segments(evidence, before, min_pixels):
-    """Segments that move as a whole, (count + 1,) bool.
+    """Segments that move as a whole, (count + 1,) bool: of at least ``min_pixels``,
 
-    A segment of at least ``min_pixels`` is dynamic
+    - with at least NEARLY_ALL dynamic pixels, or
+    - mostly dynamic, like the view, in the last frame, and mostly off the map's surface, or
+    - within MAX_SHARE of the image, with MIN_DYNAMIC dynamic pixels, and the others moved.
 
-    - if at least NEARLY_ALL of its pixels are dynamic, or
-    - if most of it, and most of the view, was dynamic in the last frame, and most of it is not near a surface of the
-      map, or
-    - if it covers at most MAX_SHARE of the image, at least MIN_DYNAMIC of its pixels are dynamic, and the others have
-      moved as well.
-
-    With the mean distance s and the intensity mismatch m, static pixels have moved if
+    With mean distance s and mismatch m, static pixels have moved if
 
         (s / S)^2 + (m / M)^2 >= 1,    or 1/2 if most of the segment was dynamic in the last frame.
 
-    S = DISTANCE_SCALE and M = MISMATCH_SCALE grow in proportion if the upper quartile of |s| or m over the static
-    segments exceeds COMMON_DISTANCE or COMMON_MISMATCH.
+    S = DISTANCE_SCALE and M = MISMATCH_SCALE grow with upper quartiles of |s| and m above COMMON_DISTANCE and
+    COMMON_MISMATCH.
 
     Args:
-        evidence: (count + 1, 5) of each segment.
-        before: (count + 1,) share of the pixels that belonged to a dynamic segment in the last frame.
-        min_pixels: Smallest number of pixels of a segment that is classified as a whole.
+        evidence: (count + 1, 5).
+        before: (count + 1,) share in a dynamic segment of the last frame.
+        min_pixels: Smallest segment classified as a whole.
     """
     count, readings, moved_before = len(evidence) - 1, 0.0, 0.0
     distances, mismatches, static = np.empty(count), np.empty(count), 0
@@ -206,7 +197,7 @@ def classify_segments(evidence, before, min_pixels):
 
 @exact_scalar
 def counts_in(labels, count, first, second):
-    """Number (count + 1,) of pixels of each segment, in total and in two masks (h, w) bool."""
+    """Pixels (count + 1,) of each segment, in all and in two masks (h, w) bool."""
     total, ones, twos = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -219,14 +210,13 @@ def counts_in(labels, count, first, second):
 
 @exact_scalar
 def split_mixed_segments(labels, count, before, total, part, min_pixels):
-    """Split segments that merge a dynamic and a static segment of the last frame; returns labels and number.
-
-    A segment is split if each part holds at least a fifth of its pixels. A smaller part has merely come into view.
+    """Split segments that merge a dynamic and a static one of the last frame, of at least a fifth each; returns labels
+    and number.
 
     Args:
         labels, count, min_pixels: As for ``SegmentImage``.
-        before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
-        total, part: (count + 1,) int64 pixels of each segment, and of these the pixels in ``before``.
+        before: (h, w) bool, in a dynamic segment of the last frame.
+        total, part: (count + 1,) int64 pixels, and pixels in ``before``.
     """
     number, first = np.zeros(count + 1, np.int32), count
     for n in range(1, len(total)):
@@ -244,23 +234,23 @@ def split_mixed_segments(labels, count, before, total, part, min_pixels):
 
 @exact
 def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dynamic):
-    """Update the dynamic pixels by segments, after ``split_mixed_segments``.
+    """Update dynamic pixels by segments, after ``split_mixed_segments``.
 
-    1. Pixels in unknown space are dynamic only in a segment with at least STARTED_SHARE seeds.
+    1. Unknown space is dynamic only in segments with STARTED_SHARE seeds.
     2. Moving segments (``classify_segments``) are dynamic as a whole.
 
     Args:
         segments: SegmentImage.
-        before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
+        before: (h, w) bool, in a dynamic segment of the last frame.
         seeds: (h, w) bool.
         sample: MapSample at the points of the image.
         intensity: (h, w) float32.
-        gain, offset: Float32, 1 minus the exposure gain, and the offset. ``gain * intensity - offset`` is added to
-            the differences, so that the image has the exposure of the map.
+        gain, offset: Float32, 1 minus the exposure gain, and offset: ``gain * intensity - offset`` is added to
+            differences.
         dynamic: (h, w) bool in and out.
 
     Returns:
-        Labels and number of the segments, some of which may have been split.
+        Labels and number of segments.
     """
     labels, count = segments.labels, segments.count
     total, started, part = counts_in(labels, count, seeds, before)
@@ -288,11 +278,7 @@ def moving_segments(segments, before, seeds, sample, intensity, gain, offset, dy
 
 @exact_scalar
 def median_mismatches(segments, labels, count, compared, moving, means):
-    """Intensity mismatch (count + 1,) of segments by medians; arguments as for ``segment_evidence``.
-
-    Pixels next to a near object show its colours. A static segment therefore differs along its outline, a moved one
-    nearly everywhere.
-    """
+    """Intensity mismatch (count + 1,) by medians, because a static segment differs along its outline only."""
     sizes, out = np.zeros(count + 1, np.int64), np.zeros(count + 1)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -316,13 +302,12 @@ def median_mismatches(segments, labels, count, compared, moving, means):
 
 @exact
 def stand_still(segments, dynamic, gap, difference, settled):
-    """Clear ``settled`` for segments whose dynamic part has moved since an older frame.
+    """Clear ``settled`` for segments that moved since an older frame. Conditions to stay:
 
-    A segment stays settled if all of these hold:
-    - More than 0.7 of its pixels are visible.
-    - Less than 0.1 of them are displaced by more than SETTLED_SIGMAS.
+    - More than 0.7 of the pixels are visible.
+    - Less than 0.1 are displaced by SETTLED_SIGMAS.
     - The mean distance is below one sigma.
-    - The intensity mismatch by medians is below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
+    - The mismatch by medians is below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
 
     Args:
         segments: SegmentImage.

@@ -1,7 +1,4 @@
-"""Surface segmentation of a depth image, along depth edges and concave edges.
-
-The scalar formulas are separate functions.
-"""
+"""Surface segmentation along depth edges and concave edges."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +6,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel, scalar
 
 PLANE_STEP = np.float32(0.35)
-"""Largest distance of a pixel from the plane of its neighbour, share of the largest depth step."""
+"""Distance of a pixel from its neighbour's plane, share of the largest depth step."""
 
 
 def segment_surface(
@@ -20,18 +17,18 @@ def segment_surface(
     normal_reach: int,
     sine: float,
 ) -> tuple[NDArray[np.int32], int]:
-    """Connected segments of surface, separated by depth edges and concave edges.
+    """Connected segments of surface between depth edges and concave edges.
 
     Args:
         depth: (h, w) float32, metres, 0 = none.
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
-        reach: Pixels from a concave edge to the normals compared on either side.
-        normal_reach: Pixels to either side over which a normal is estimated.
-        sine: Sine of half the smallest angle between the normals across a concave edge.
+        tolerance: (h, w) float32, largest depth step within a surface, metres.
+        reach: Pixels from a concave edge to the compared normals.
+        normal_reach: Half width of a normal's window, pixels.
+        sine: Of half the smallest angle across a concave edge.
 
     Returns:
-        (h, w) int32 number of each pixel's segment from 1, 0 = no depth, and the number of segments.
+        (h, w) int32 segment from 1, 0 = no depth, and their number.
     """
     normals = np.empty((*depth.shape, 3), dtype=np.float32)
     edge = np.empty(depth.shape, dtype=np.bool_)
@@ -43,7 +40,7 @@ def segment_surface(
 
 @scalar
 def surface_end(depth, tolerance, v, u, dv, du, reach):
-    """Number of pixels (0 to ``reach``) on the same surface in a direction."""
+    """Pixels (0 to ``reach``) on the same surface in a direction."""
     z = depth[v, u]
     for step in range(1, reach + 1):
         vn, un = v + dv * step, u + du * step
@@ -57,8 +54,7 @@ def surface_end(depth, tolerance, v, u, dv, du, reach):
 
 @scalar
 def normal_of_gradient(x, y, z, zu, zv):
-    """Unit normal, towards the camera, of a surface at normalised image point (x, y) and depth z. (zu, zv) is the
-    depth gradient over normalised image coordinates."""
+    """Unit normal, towards the camera, at normalised (x, y) and depth z with gradient (zu, zv)."""
     nx, ny, nz = zu, zv, -(z + x * zu + y * zv)
     length = np.sqrt(nx * nx + ny * ny + nz * nz)
     return nx / length, ny / length, nz / length
@@ -66,26 +62,25 @@ def normal_of_gradient(x, y, z, zu, zv):
 
 @scalar
 def is_concave(turn, length, sine):
-    """Whether two surface points lie on either side of a concave edge.
+    """Whether two points lie on either side of a concave edge.
 
     Args:
-        turn: (n_b - n_a) . (b - a) of points a, b and their unit normals: negative across a concave edge, positive
-            across a ridge (Stein et al. 2014).
+        turn: (n_b - n_a) . (b - a) of points and unit normals: negative across a concave edge (Stein et al. 2014).
         length: |b - a|.
-        sine: Sine of half the smallest angle between the normals.
+        sine: Of half the smallest angle.
     """
     return turn < -np.float32(2) * sine * length
 
 
 @scalar
 def plane_distance(nx, ny, nz, ex, ey, ez):
-    """Distance of a point from the plane with unit normal n; e is the point relative to a point of the plane."""
+    """Distance of a point e, relative to a plane's point, from the plane with unit normal n."""
     return abs(nx * ex + ny * ey + nz * ez)
 
 
 @scalar
 def plane_step(depth, intrinsics, normals, v, u, vn, un):
-    """Smaller of the distances of two neighbouring points from each other's plane, metres."""
+    """Smaller distance of two neighbours from each other's plane, metres."""
     z, zn = depth[v, u], depth[vn, un]
     ex = ((np.float32(un) - intrinsics[2]) * zn - (np.float32(u) - intrinsics[2]) * z) / intrinsics[0]
     ey = ((np.float32(vn) - intrinsics[3]) * zn - (np.float32(v) - intrinsics[3]) * z) / intrinsics[1]
@@ -97,7 +92,7 @@ def plane_step(depth, intrinsics, normals, v, u, vn, un):
 
 @kernel
 def concave_edges(depth, intrinsics, tolerance, reach, normal_reach, sine, normals, edge):
-    """Normals, and pixels on concave edges: they separate an object from the floor, but not the faces of a box.
+    """Normals, and pixels on concave edges, which separate an object from the floor.
 
     Args:
         depth, intrinsics, tolerance, reach, normal_reach, sine: See ``segment_surface``.
@@ -151,12 +146,12 @@ def concave_edges(depth, intrinsics, tolerance, reach, normal_reach, sine, norma
 
 @kernel
 def connected_segments(depth, intrinsics, tolerance, normals, edge, labels, passes):
-    """Connected components between the edges; pixels on a concave edge then join the neighbour nearest in depth.
+    """Connected components; pixels on a concave edge join the neighbour nearest in depth.
 
     Args:
         depth, intrinsics, tolerance, normals, edge: See ``concave_edges``.
-        labels: (h, w) int32 out: number from 1, 0 = no depth.
-        passes: Pixels by which a segment may grow over the pixels of an edge.
+        labels: (h, w) int32 out, from 1, 0 = no depth.
+        passes: Pixels by which segments grow over an edge.
 
     Returns:
         Number of segments.

@@ -1,4 +1,4 @@
-"""Point splatting: points of earlier images projected into the image of a new pose."""
+"""Point splatting: points of earlier images in a new image."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.threads import kernel
 
 SAME_SURFACE = np.float32(0.05)
-"""Largest distance of two measurements of a pixel on the same surface, as a share of the depth."""
+"""Largest distance of measurements on one surface, share of the depth."""
 NEAREST = np.float32(0.05)
 """Smallest depth of a projected point, metres."""
 
@@ -18,8 +18,8 @@ class PointImage(NamedTuple):
 
     Attributes:
         points: (h, w, 3) float32, world frame, metres.
-        intensities: (h, w) float32, NaN = no point; the other arrays are then arbitrary.
-        times: (h, w, 2) float64, seconds: first and last observation of the point's surface.
+        intensities: (h, w) float32, NaN = no point.
+        times: (h, w, 2) float64, seconds: first and last observation.
     """
 
     points: NDArray[np.float32]
@@ -35,13 +35,13 @@ class PointImage(NamedTuple):
 def splat(
     image: PointImage, T_camera_world: NDArray[np.float64], intrinsics: NDArray[np.float32], since: float
 ) -> PointImage:
-    """The nearest point in each pixel of a camera.
+    """The nearest point per pixel of a camera.
 
     Args:
         image: Points in the world.
         T_camera_world: (4, 4).
         intrinsics: (4,) float32 fx, fy, cx, cy.
-        since: Points last observed before this time are left out, seconds.
+        since: Oldest last observation, seconds.
     """
     out = PointImage.empty(image.intensities.shape)
     points, intensities, times = image
@@ -61,12 +61,10 @@ def overwrite(
     T_world_camera: NDArray[np.float64],
     intrinsics: NDArray[np.float32],
 ) -> None:
-    """Replace the points of the pixels ``used`` by the measurements of an image.
-
-    The time of the first observation is kept if the measurement lies on the same surface.
+    """Replace the points of ``used`` pixels by an image's measurements; on the same surface the first time is kept.
 
     Args:
-        image: Points by pixel of the same camera pose; changed.
+        image: Points by pixel of the same pose; changed.
         depth, intensity: (h, w) float32; depth in metres, 0 = none.
         used: (h, w) bool.
         time: Seconds.

@@ -1,4 +1,4 @@
-"""The voxels of a block and of its surroundings."""
+"""A block's voxels with surroundings."""
 
 import numpy as np
 
@@ -7,12 +7,12 @@ from dudmap.core.backends.threads import scalar
 
 @scalar
 def surrounded(voxels, near, words):
-    """Words of a block and of the voxels around it; 0 without a block.
+    """Words of a block and the voxels around; 0 without a block.
 
     Args:
         voxels: (slots, 512) int32.
-        near: (27,) int32 slots of the block and its neighbours, see ``VoxelBlocks.neighbourhood``.
-        words: (8 + 2 k, 8 + 2 k, 8 + 2 k) int32 out, with k voxels on each side.
+        near: (27,) int32 slots, see ``VoxelBlocks.neighbourhood``.
+        words: (8 + 2 k, 8 + 2 k, 8 + 2 k) int32 out.
     """
     size = len(words)
     pad = (size - 8) // 2

@@ -1,11 +1,11 @@
 """Marching-cubes tables (Lorensen & Cline 1987), derived by code.
 
-Corner ``4 dx + 2 dy + dz`` of a cell lies at offset (dx, dy, dz). Bit k of a case is set if corner k is inside (sdf <
-0). An edge is a pair (corner, axis) of its lower end and its direction.
+Corner ``4 dx + 2 dy + dz`` lies at (dx, dy, dz). Bit k of a case is set if corner k is inside (sdf < 0). An edge is
+(lower corner, axis).
 
-On each face the surface is one or two segments between crossed edges, which depend on the signs of that face only. On
-an ambiguous face each inside corner gets its own. Neighbours therefore agree, and the mesh has no cracks. The segments
-form closed loops, triangulated without diagonals inside a face: these could coincide with the neighbour's.
+On each face the surface is one or two segments between crossed edges, by that face's signs only; if ambiguous, each
+inside corner gets its own. The mesh has no cracks. Closed loops of segments are triangulated without diagonals inside a
+face, which could coincide with a neighbour's.
 """
 
 import itertools
@@ -24,7 +24,6 @@ def _edge_between(a: int, b: int) -> int:
 
 
 def _faces() -> list[list[int]]:
-    """Corners of the six faces, counter-clockwise seen from outside the cell."""
     out = []
     for axis, side in itertools.product(range(3), (0, 1)):
         u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -47,10 +46,6 @@ EDGE_FACES = tuple(
 
 
 def _segments(case: int) -> dict[int, int]:
-    """Segments of all faces, from crossed edge to crossed edge; the inside is on the right, seen from outside the cell.
-
-    A segment starts at the edge that enters the inside, counter-clockwise, and ends at the edge that leaves it.
-    """
     out = {}
     for face in FACES:
         inside = [bool(case >> corner & 1) for corner in face]
@@ -88,7 +83,6 @@ def _triangulations(n: int) -> list[list[tuple[int, int, int]]]:
 
 
 def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
-    """Triangulation of a loop with the fewest diagonals within a face."""
     n = len(loop)
 
     def in_faces(triangles: list[tuple[int, int, int]]) -> int:
@@ -102,7 +96,7 @@ def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
 
 
 def triangles(case: int) -> list[tuple[int, int, int]]:
-    """Triangles of a case as triples of edges, counter-clockwise seen from outside (sdf > 0)."""
+    """Triangles of a case as edges, counter-clockwise seen from outside (sdf > 0)."""
     return [triangle for loop in _loops(case) for triangle in _cut(loop)]
 
 
@@ -116,4 +110,4 @@ def _table() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 
 TRIANGLES, TRIANGLE_COUNT = _table()
-"""(256, 15, 2) uint8: per case up to five triangles of three edges (lower corner, axis); (256,) uint8: their number."""
+"""(256, 15, 2) uint8: up to five triangles of three edges (lower corner, axis); (256,) uint8: their number."""

@@ -1,7 +1,7 @@
-"""Threads that share the bands of consecutive steps inside one compiled call.
+"""Threads that share the bands of consecutive steps in one compiled call.
 
-One thread leads: it announces a step, works on its bands, and waits until all are done. Taking a band adds 1 to a
-ticket that also holds the step number. A late thread therefore finds no band or one of a later step.
+One thread leads: it announces a step, works, and waits for all. Tickets hold step and band, so that a late thread finds
+no band or a later step's.
 """
 
 import sys
@@ -14,12 +14,12 @@ from numba.extending import intrinsic
 from dudmap.core.backends.threads import also_in_other_threads, num_threads, scalar
 
 TICKET, DONE = 0, 8
-"""Places, on two cache lines, of the next ticket (step << 32 | band) and of the number of finished bands."""
+"""Places, on two cache lines, of the next ticket (step << 32 | band) and the finished bands."""
 FINISHED = -(1 << 62)
 """Ticket after the last step."""
 NO_BAND = -1
 PATIENCE = 4096
-"""Times that an idle thread yields its core before it leaves, about a millisecond."""
+"""Times that an idle thread yields before it leaves, about a millisecond."""
 
 if sys.platform == "win32":
     _yield_core = njit(lambda: None, cache=False)
@@ -61,14 +61,14 @@ def _store(typing_context, array, index, value):
 
 @scalar
 def announce(team, step):
-    """Leader: offer the bands of the next step to all threads."""
+    """Leader: offer the next step's bands."""
     _store(team, DONE, 0)
     _store(team, TICKET, step << 32)
 
 
 @scalar
 def take(team, num_bands):
-    """The next band of the current step, or ``NO_BAND``, and the number of the step; ``FINISHED`` after the last."""
+    """The next band of the step, or ``NO_BAND``, and the step; ``FINISHED`` after the last."""
     ticket = _load(team, TICKET)
     if ticket < 0:
         return NO_BAND, FINISHED
@@ -89,14 +89,14 @@ def done(team):
 
 @scalar
 def wait_for_all(team, num_bands):
-    """Leader: wait until all bands of the step are done."""
+    """Leader: wait until all bands are done."""
     while _load(team, DONE) < num_bands:
         _yield_core()
 
 
 @scalar
 def wait_for_work(team, num_bands):
-    """Other threads: the next band and its step; ``NO_BAND`` if no work is left."""
+    """Other threads: the next band and its step; ``NO_BAND`` without work."""
     for _ in range(PATIENCE):
         band, step = take(team, num_bands)
         if band != NO_BAND or step == FINISHED:
@@ -107,7 +107,7 @@ def wait_for_work(team, num_bands):
 
 @scalar
 def first_band(leads, team, step, num_bands):
-    """First band of the next step, which the leading thread announces, and the number of the step."""
+    """First band of the announced step, and its number."""
     if leads:
         announce(team, step)
         return take(team, num_bands)
@@ -121,12 +121,11 @@ def finish(team):
 
 
 def run_team(function, num_bands, *arguments):
-    """Result of a compiled ``function(leads, team, *arguments)``, which other threads execute concurrently.
+    """Result of a compiled ``function(leads, team, *arguments)``, executed by several threads.
 
     Args:
-        function: Kernel; ``leads`` is True in the thread that returns the result.
-        num_bands: Bands of each step; one band needs no other thread.
-        arguments: Arguments of the function.
+        function: Kernel; ``leads`` is True in the thread with the result.
+        num_bands: Per step; one band needs no other thread.
     """
     team = np.zeros(16, dtype=np.int64)
     team[TICKET] = num_bands  # nothing to take before the first step

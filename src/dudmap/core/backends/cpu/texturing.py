@@ -1,4 +1,4 @@
-"""Triangles drawn into an image, and colours of a texture gathered from images."""
+"""Triangles drawn into an image, and texture colours gathered from images."""
 
 import numpy as np
 
@@ -7,18 +7,18 @@ from dudmap.core.backends.threads import kernel
 NEAREST = np.float32(0.05)
 """Smallest depth of a drawn corner, metres."""
 OCTAVE, OCTAVES = 256, 20
-"""Steps of a logarithmic weight per factor of 2, and smallest weight, 2^-20, whose step is 1."""
+"""Steps of a logarithmic weight per factor of 2, and smallest weight, 2^-20."""
 
 
 @kernel
 def draw_triangles(points, faces, margin, numbers, keys):
-    """Draw triangles; the smallest key of a pixel wins.
+    """Draw triangles; the smallest key wins: depth, or with a ``margin`` (pixels) the distance from the triangle.
 
-    The key is the depth. With a ``margin`` (pixels) pixels outside of a triangle up to this distance belong to it as
-    well, and the key is the distance.
+    With a ``margin`` (pixels) pixels outside of a triangle up to this distance belong to it as well, and the key is the
+    distance.
 
     ``points`` (V, 3) float32 are column, row and depth, ``faces`` (F, 3). ``numbers`` (h, w) int32 and ``keys`` (h, w)
-    float32 are output: the triangle of each pixel.
+    float32: output.
     """
     h, w = numbers.shape
     for f in range(len(faces)):
@@ -54,18 +54,18 @@ def draw_triangles(points, faces, margin, numbers, keys):
 
 @kernel
 def gather_colors(start, stop, numbers, H, quality, tolerance, depth, weights, image, found, colors):
-    """Offer the colours of an image to the texels in some rows; each keeps the best ones.
+    """Offer an image's colours to texels; each keeps the best.
 
     Args:
-        start, stop: Rows of the texture.
-        numbers: (S, S) int32, triangle of each texel, -1 = none.
-        H: (F, 3, 3) float32; (column, row, 1) of a texel of a triangle to (u z, v z, z) of the image.
-        quality: (F,) int32, logarithm of the weight of the image for a triangle, in ``OCTAVE``; 0 = not visible.
-        tolerance: (F,) float32, metres behind ``depth`` at which a texel is hidden.
-        depth: (h, w) float32, metres, of the mesh in the image.
-        weights: (h, w) int32, the same of the pixels of the image; 0 = not to be used.
+        start, stop: Texture rows.
+        numbers: (S, S) int32 triangle, -1 = none.
+        H: (F, 3, 3) float32; texel (column, row, 1) to (u z, v z, z) of the image.
+        quality: (F,) int32, logarithmic weight of the image, in ``OCTAVE``; 0 = not visible.
+        tolerance: (F,) float32, metres behind ``depth``.
+        depth: (h, w) float32, metres, of the mesh.
+        weights: (h, w) int32, logarithmic weight of pixels; 0 = unused.
         image: (h, w, 3) uint8.
-        found: (S, S, K) uint16, sum of both for the best colours, in descending order; changed.
+        found: (S, S, K) uint16, sums of both, descending; changed.
         colors: (S, S, K, 3) uint8; changed.
     """
     (h, w), K = depth.shape, found.shape[2]

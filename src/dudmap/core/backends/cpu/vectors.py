@@ -4,16 +4,13 @@ from numba.core import types
 from numba.extending import intrinsic
 
 WIDTH = 512
-"""Bits. Processors with shorter registers use their own width."""
+"""Bits; processors with shorter registers use their own width."""
 
 
 @intrinsic
 def wide_vectors(typing_context):
-    """Compile the loops of the enclosing kernel for registers of ``WIDTH`` bits, if the processor has them.
-
-    By default LLVM uses half of an AVX-512 register, because the first generation reduced its clock for longer ones.
-    Only loops with much arithmetic per load gain.
-    """
+    """Compile the enclosing kernel's loops for ``WIDTH`` bits, if available; LLVM uses half by default. Only loops with
+    much arithmetic gain."""
 
     def generate(context, builder, signature, arguments):
         set.add(builder.function.attributes, f'"prefer-vector-width"="{WIDTH}"')  # llvmlite only lists plain names

@@ -1,4 +1,4 @@
-"""Loops over blocks: blocks that a depth image touches, can change, or observes as empty (thesis section 4.5)."""
+"""Loops over blocks that a depth image touches, changes, or observes as empty (thesis section 4.5)."""
 
 import numpy as np
 
@@ -8,9 +8,9 @@ from dudmap.core.formulas.pixel import band_behind, band_front, elements, projec
 
 TILE = 8
 SETTLED = 8
-"""Fused frames after which a far block is updated in every second frame only."""
+"""Fused frames after which a far block alternates."""
 REACH = np.float32(0.8661)
-"""Radius of the sphere around a block over its edge: half of the space diagonal."""
+"""Radius around a block over its edge: half of the diagonal."""
 
 
 @scalar
@@ -18,24 +18,23 @@ def mark_blocks(
     row_start, row_stop, stride, depth, intrinsics, T, shape, window, free_count, free_after, frame_number, stamps,
     band, block_size, found,
 ):  # fmt: skip
-    """Window cells of blocks without voxels that the truncation bands of a depth image touch.
+    """Window cells without voxels that an image's truncation bands touch.
 
-    A known free block gets voxels only within the fixed part of the band. In the part that grows with the noise, blocks
-    would appear and vanish. Addresses of a whole row are computed before cells are read.
+    A known free block gets voxels only in the fixed part of the band, which does not flicker with noise. Addresses of a
+    row come before reads.
 
     Args:
-        row_start, row_stop, stride: Rows of the band, and the step between pixels.
-        T: (3, 4) float32, camera to window blocks: block units, origin at the window's first block.
+        row_start, row_stop, stride: Rows, and pixel step.
+        T: (3, 4) float32, camera to window blocks, origin at the first.
         shape, window, free_count: See ``VoxelGrid``.
-        free_after: Observations that make a block known free space.
+        free_after: Observations of free space.
         frame_number: Number of this frame.
-        stamps: (cells,) int32, number of the last frame that found each cell; changed here. Two bands may both find
-            one.
+        stamps: (cells,) int32, last frame that found each cell; changed.
         band: TruncationBand.
         found: (n,) int32 out.
 
     Returns:
-        Number of cells found, at most ``len(found)``.
+        Number of found cells, at most ``len(found)``.
     """
     wide_vectors()
     count, w = 0, -(-depth.shape[1] // stride)
@@ -80,7 +79,7 @@ def mark_blocks(
 
 @scalar
 def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
-    """Depth range and share of pixels with depth, per tile of the depth image.
+    """Depth range and share with depth, per tile.
 
     Args:
         nearest, farthest, valid: Out, see ``DepthTiles``.
@@ -113,22 +112,22 @@ def visible_slots(
     start, stop, slots, coords, fused, turn, T, intrinsics, size, block_size, farthest, band, depth_min, depth_max,
     out, repeats,
 ):  # fmt: skip
-    """Slots of the blocks that a depth image can change and that are updated in this frame.
+    """Slots of blocks that a depth image can change in this frame.
 
-    A block alternates if the sensor noise is wider than the band and SETTLED frames have been fused into it. It is
-    updated in every second frame with double weight, half of these blocks in even frames.
+    A block alternates if noise exceeds the band after SETTLED frames: every second frame, double weight, half of them
+    in even frames.
 
     Args:
         slots: (n,) int32 candidates.
-        coords: (num_slots, 3) int32 block coordinates by slot, relative to the origin of T.
-        fused: (num_slots,) uint8 frames that were fused into a slot.
-        turn: Number of this frame; negative = all blocks are updated in every frame.
+        coords: (num_slots, 3) int32, relative to the origin of T.
+        fused: (num_slots,) uint8 fused frames.
+        turn: Frame; negative = all are updated.
         T: (3, 4) float32, world to camera.
         farthest: See ``DepthTiles``.
         band: TruncationBand.
         depth_min, depth_max: Depth range, metres.
         out: (n,) int32 out, written from ``start``.
-        repeats: (n,) float32 out, number of frames that this frame stands for.
+        repeats: (n,) float32 out, frames that this one stands for.
 
     Returns:
         Number of slots written.
@@ -177,24 +176,22 @@ def observe_free(
     x_start, x_stop, x_step, window, shape, origin, T, intrinsics, size, block_size, nearest, valid, band, depth_max,
     counts, repeats, free_after, found,
 ):  # fmt: skip
-    """Add observations of emptiness to window cells without voxels in front of all surfaces of a depth image.
-
-    Cells without an entry are listed instead. Columns outside of the view frustum are skipped.
+    """Add observations of emptiness to window cells without voxels before all surfaces; list those without entry.
 
     Args:
-        x_start, x_stop, x_step: Window planes of this call.
+        x_start, x_stop, x_step: Window planes.
         window, shape, origin: See ``VoxelGrid``.
         T: (3, 4) float32, world to camera.
         nearest, valid: See ``DepthTiles``.
         band: TruncationBand.
         depth_max: Largest depth, metres.
-        counts: (entries,) uint8, observations of emptiness by entry; changed here.
+        counts: (entries,) uint8, changed.
         repeats: Observations to add.
-        free_after: Observations after which a cell is not visited again.
-        found: (n,) int32 out, cells without an entry.
+        free_after: Observations after which a cell is skipped.
+        found: (n,) int32 out, cells without entry.
 
     Returns:
-        Number of cells found, at most ``len(found)``.
+        Number of found cells, at most ``len(found)``.
     """
     count = 0
     radius = REACH * block_size

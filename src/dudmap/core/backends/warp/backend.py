@@ -1,7 +1,6 @@
-"""GPU back end: Warp kernels for the loops over pixels and voxels of a frame.
+"""GPU back end: Warp kernels for loops over pixels and voxels.
 
-The voxels stay on the device. The CPU manages the blocks and computes meshes, views, labels and maps with several voxel
-sizes.
+The voxels stay on the device; the CPU manages blocks and does the rest.
 """
 
 # Warp's annotations say float for any type of number
@@ -42,10 +41,7 @@ PER_THREAD = 8
 
 
 class WarpBackend(CpuBackend):
-    """``Backend`` on a device of Warp: "cuda:0", or "warp-cpu", which runs the same kernels on the CPU for tests.
-
-    Other operations are inherited from the CPU.
-    """
+    """``Backend`` on "cuda:0", or "warp-cpu" for tests; other operations are the CPU's."""
 
     def __init__(self, device: str) -> None:
         super().__init__()
@@ -56,7 +52,7 @@ class WarpBackend(CpuBackend):
     def fuse(
         self, grid: VoxelGrid, view: DepthView, touched: TouchedBlocks, visit: BlockVisit, parameters: FusionParameters
     ) -> FusedBlocks:
-        """See ``Backend.fuse``; the CPU packs the pixels, finds the blocks in view, and observes free space."""
+        """See ``Backend.fuse``; the CPU packs pixels, finds blocks in view, and observes free space."""
         (slots, _, empty), repeats, pixels = self._fused(grid, view, touched, visit, parameters, averages=False)
         p, (height, width) = struct(parameters), view.depth.shape
         with self._using():

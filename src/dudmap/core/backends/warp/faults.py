@@ -1,7 +1,6 @@
-"""Device failures: an exception of Warp becomes one sentence, and the process no longer uses the device.
+"""Device failures: an exception of Warp becomes one sentence, and the device is not used again.
 
-Warp raises RuntimeError, and Exception itself if a module cannot be loaded. After most GPU failures the context of the
-process is unusable.
+Warp raises RuntimeError, or Exception for a module; most GPU failures break the process' context.
 """
 
 import threading
@@ -20,7 +19,7 @@ def is_lost(device: str) -> bool:
 
 
 def forget() -> None:
-    """Use failed devices again; for tests that simulate failures."""
+    """Use failed devices again, for tests."""
     _lost.clear()
 
 

@@ -1,4 +1,4 @@
-"""Device arrays: persistent copies of the map, upload and download of images."""
+"""Device arrays: copies of the map, upload and download."""
 
 # Warp's annotations name float for any type of number
 # pyright: reportArgumentType=false, reportReturnType=false
@@ -37,10 +37,8 @@ def down(array: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
 
 
 class RowCopy:
-    """Copy of an int32 array (rows,) or (rows, width) on a device; see ``Mirror.copy``.
-
-    If the device fails, its writes since the last ``pull`` are lost.
-    """
+    """Copy of an int32 array (rows,) or (rows, width) on a device; see ``Mirror.copy``. A failure loses writes since
+    ``pull``."""
 
     def __init__(self, device: str) -> None:
         self.device = device
@@ -99,7 +97,7 @@ class RowCopy:
 
 
 def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: ANN401 - an array of Warp
-    """The array on a device: the persistent copy of a mirror, created at first use, or a temporary copy of an array."""
+    """The array on a device: a mirror's copy, or a temporary one."""
     if not isinstance(array, Mirror):
         return up(array, device)
     if not (isinstance(array.copy, RowCopy) and array.copy.device == device):
@@ -109,7 +107,7 @@ def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: AN
 
 
 def wrote(array: Mirror | NDArray[np.int32], rows: NDArray[np.int32]) -> None:
-    """Mark rows (n,) of a mirror as written by a kernel; a plain array would not see the change."""
+    """Mark rows (n,) of a mirror as written by a kernel."""
     if not (isinstance(array, Mirror) and isinstance(array.copy, RowCopy)):
         raise TypeError("the device writes to mirrors only; a plain array would not see the change")
     array.copy.device_wrote(rows)

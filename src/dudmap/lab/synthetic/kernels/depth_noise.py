@@ -1,4 +1,4 @@
-"""Simulation of a depth and colour sensor: seeded noise, quantisation, occlusion shadows and missing depth."""
+"""Simulation of a depth and colour sensor: noise, quantisation, occlusion shadows, missing depth."""
 
 import numpy as np
 
@@ -18,8 +18,8 @@ def _mix(a, b, key):
 def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal, model, depth):
     """Depth measured by a disparity sensor in the rows [row_from, row_to); ``model`` is ``sensors.SensorModel.row``.
 
-    exact, cosines (H, W) float32; smooth (S, S) float32 periodic correlated noise of unit variance, S a power of two;
-    offsets (4, 2) into it for this frame; key uint64; depth (H, W) float32 output, 0 = missing.
+    exact, cosines (H, W) float32; smooth (S, S) float32 periodic noise of unit variance, S a power of two; offsets (4,
+    2) into it; key uint64; depth (H, W) float32 output, 0 = missing.
     """
     height, width = exact.shape
     wrap = smooth.shape[0] - 1
@@ -94,9 +94,9 @@ def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal,
 
 @compiled(fastmath=False)
 def measure_color(row_from, row_to, exact, table, key, sigma, color):
-    """Add noise of ``sigma`` grey values to exact (H, W, 3) float32 and round into color (H, W, 3) uint8.
+    """Add ``sigma`` grey values of noise to exact (H, W, 3) float32 into color (H, W, 3) uint8.
 
-    table (65536,) float32 holds unit Gaussian samples.
+    table (65536,) float32: unit Gaussian samples.
     """
     height, width, _ = exact.shape
     for v in range(row_from, row_to):
@@ -110,10 +110,10 @@ def measure_color(row_from, row_to, exact, table, key, sigma, color):
 
 @compiled(fastmath=False)
 def measure_range(row_from, row_to, exact, cosines, smooth, offsets, key, model, depth):
-    """Depth measured by a time-of-flight sensor in the rows; ``model`` is ``sensors.TimeOfFlightModel.row``.
+    """Depth measured by a time-of-flight sensor; ``model`` is ``sensors.TimeOfFlightModel.row``.
 
-    Arguments as of ``measure_depth``. The standard deviation is (s0 + s1 z + s2 z^2) plus
-    s_angle z^1.5 (theta / (pi/2 - theta))^2, theta the angle of incidence.
+    Arguments as of ``measure_depth``. The standard deviation is (s0 + s1 z + s2 z^2) plus s_angle z^1.5 (theta / (pi/2
+    - theta))^2.
     """
     height, width = exact.shape
     wrap = smooth.shape[0] - 1

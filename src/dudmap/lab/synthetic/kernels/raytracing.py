@@ -1,10 +1,8 @@
 """Rendering of analytic scenes: exact depth, the visible primitive, anti-aliased colour.
 
-A primitive is a kind, half sizes and a rigid pose. With the ray ``(x/z, y/z, 1) * t`` the parameter t is the depth
-along the optical axis in metres, float64. Rays meet boxes, ellipsoids, capsules and cylinders in closed form, so that
-wires thinner than a pixel are exact. The torus is sphere traced (Hart 1996), because its quartic is badly conditioned.
-Primitives are binned into screen tiles. A tile visits them front to back until the nearest remaining one lies behind
-everything hit.
+A primitive is a kind, half sizes and a rigid pose. With the ray ``(x/z, y/z, 1) * t``, t is the depth, metres, float64.
+Boxes, ellipsoids, capsules and cylinders are in closed form; the torus is sphere traced (Hart 1996). Primitives are
+binned into tiles, front to back until everything hit is nearer.
 """
 
 import numpy as np
@@ -23,7 +21,7 @@ _MATHS = {"nsz", "contract", "reassoc"}
 
 @compiled(fastmath=_MATHS)
 def box_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
-    """Entry of the ray o + t d into the box |x| <= hx, |y| <= hy, |z| <= hz; inf if missed (slab method)."""
+    """Entry of the ray o + t d into a box; inf if missed (slab method)."""
     ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
     mx, my, mz = -ox * ix, -oy * iy, -oz * iz
     kx, ky, kz = abs(ix) * hx, abs(iy) * hy, abs(iz) * hz
@@ -106,7 +104,7 @@ def torus_depth(ox, oy, oz, dx, dy, dz, ring, _, tube):
 
 @compiled(fastmath=_MATHS)
 def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
-    """Depth at which the ray o + t d, in the primitive's own frame, enters it; inf if it does not."""
+    """Entry depth of the ray o + t d, own frame; inf if missed."""
     if kind == BOX:
         return box_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
     if kind == ELLIPSOID:
@@ -135,12 +133,12 @@ def trace_row(depth_of, p, u0, fx, cx, origin, ray, step, half, out):
 def trace(
     row_from, row_to, order, nearest, in_columns, in_rows, kinds, rotations, origins, halves, intrinsics, depth, ids
 ):
-    """Exact depth and visible primitive of the tile rows [row_from, row_to).
+    """Exact depth and visible primitive of tile rows.
 
     Args:
-        order: (P,) primitives front to back.
+        order: (P,) front to back.
         nearest: (P,) their smallest depths.
-        in_columns, in_rows: (P, C) and (P, R), whether a primitive touches a tile column or row.
+        in_columns, in_rows: (P, C) and (P, R), touched tile columns and rows.
         kinds: (P,).
         rotations: (P, 3, 3) camera to primitive.
         origins: (P, 3) camera centre in the primitive's frame.
@@ -249,9 +247,8 @@ def texture_color(atlas, texture, level, u, v):
 def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textures, atlas, lights, up, focal):
     """Colour (0..1, three numbers) and cosine of incidence of primitive p at the hit (x, y, 1) t of a ray.
 
-    Textures are projected along the largest component of the normal and filtered by the pixel's footprint (mip map).
-    Light is Lambert's law from point lights plus a hemisphere that is brighter above. See Renderer for the columns of
-    materials and lights.
+    Textures are projected along the largest normal component, with mip maps. Light: Lambert's law plus a hemisphere.
+    See Renderer for the columns of materials and lights.
     """
     X, Y = x * t, y * t
     px = rotations[p, 0, 0] * X + rotations[p, 0, 1] * Y + rotations[p, 0, 2] * t + origins[p, 0]
@@ -306,8 +303,7 @@ def shade(
 ):  # fmt: skip
     """Colour (adds into (H, W, 3) float32, 0..255) and cosine of incidence (H, W) float32 of the tile rows.
 
-    Pixels at the border between two primitives are averaged over 2x2 rays. Others need one ray, because the mip map
-    filters inside a surface.
+    Pixels between two primitives are averaged over 2x2 rays.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
@@ -376,10 +372,10 @@ def shade(
 
 @compiled(fastmath=False)
 def count_views(first, last, vertices, normals, T, intrinsics, depth, near, far, grazing, counts):
-    """Add one to counts[k] for every vertex in [first, last) that the ideal depth image (H, W) shows.
+    """Add one to counts[k] for every vertex in [first, last) visible in the depth image (H, W), within the slant of a
+    pixel, between near and far (m), at a cosine above grazing.
 
-    A vertex counts between near and far (m) and at a cosine of incidence above grazing. The tolerance is the slant of
-    one pixel. vertices, normals (V, 3) float32 world; T (4, 4) world to camera; intrinsics fx fy cx cy.
+    vertices, normals (V, 3) float32 world; T (4, 4) world to camera; intrinsics fx fy cx cy.
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]

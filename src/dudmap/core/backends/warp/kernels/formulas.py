@@ -1,8 +1,6 @@
-"""The scalar formulas of the CPU kernels (``dudmap/core/backends/cpu``), compiled by Warp from the same source.
+"""Formulas of the CPU kernels, compiled by Warp from the same source.
 
-``warp_function`` replaces the globals of the code object of a plain function on float32 and int32 by their Warp
-counterparts and passes it to ``wp.func``. This file defines the operations that Warp lacks: ``&`` and ``|`` of two
-booleans, and parts of a packed word.
+``warp_function`` replaces globals of a plain function by Warp's counterparts for ``wp.func``.
 """
 
 import inspect
@@ -71,7 +69,7 @@ _NUMPY = types.SimpleNamespace(
     floor=wp.floor, ceil=wp.ceil, sqrt=wp.sqrt, exp=wp.exp, sin=wp.sin, cos=wp.cos,
     minimum=wp.min, maximum=wp.max, where=wp.where,
 )  # fmt: skip
-"""Functions of NumPy and ``math`` that the formulas use. Indices of 64 bits fit into 32 here."""
+"""Functions of NumPy and ``math`` in formulas; 64-bit indices fit into 32."""
 _OF_NUMPY = {
     np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.int64: wp.int32, np.floor: wp.floor,
     np.sqrt: wp.sqrt, np.exp: wp.exp,
@@ -81,8 +79,7 @@ _compiled: dict[Formula, wp.Function] = {}
 
 
 def warp_function(formula: Formula) -> wp.Function:
-    """Warp function with the code of a formula for Numba, or of a plain function, including all functions that it
-    calls."""
+    """Warp function of a formula, with all functions that it calls."""
     if formula not in _compiled:
         function = formula if isinstance(formula, types.FunctionType) else formula.py_func
         names = {**function.__globals__, "bit_and": bit_and, "bit_or": bit_or, **_OWN}

@@ -1,6 +1,6 @@
 """Fusion of a depth image into the blocks in view (thesis section 4.5, algorithm 1).
 
-The arithmetic before the shared formulas equals ``core/backends/cpu/integration.py``.
+The arithmetic equals ``core/backends/cpu/integration.py``.
 """
 
 import warp as wp
@@ -26,10 +26,9 @@ def integrate(
     height: int, width: int, pixels: wp.array2d(dtype=wp.int32), geometry: wp.array2d(dtype=wp.int32),
     colors: wp.array2d(dtype=wp.int32), p: FusionParameters, occupied: Indices,
 ):  # fmt: skip
-    """Fuse the image into one voxel per thread: see ``integration.integrate_blocks``.
+    """One voxel per thread: see ``integration.integrate_blocks``. Integer counts do not depend on the order.
 
-    ``coords`` (n, 3) are the coordinates of ``slots`` (n,). The count of occupied voxels is an integer, so that its sum
-    does not depend on the order.
+    ``coords`` (n, 3) are the coordinates of ``slots`` (n,).
     """
     block, n = wp.tid()
     slot = slots[block]

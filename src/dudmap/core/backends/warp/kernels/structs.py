@@ -1,4 +1,4 @@
-"""Named tuples of ``core/backends/parameters.py`` as Warp structures: the same names, every number float32."""
+"""Named tuples of ``core/backends/parameters.py`` as Warp structures of float32."""
 
 from typing import Any
 
@@ -36,8 +36,8 @@ class Camera:
 
 @wp.struct
 class Lattice:
-    """The window of blocks around the view: slot of the voxels of each block (-1 = unknown; -2 - entry = without
-    voxels), (slots, 512) packed voxels, and blocks along each axis."""
+    """The window: slot of each block (-1 = unknown; -2 - entry = without voxels), (slots, 512) packed voxels, blocks
+    along each axis."""
 
     cells: wp.array(dtype=wp.int32)
     geometry: wp.array2d(dtype=wp.int32)

@@ -1,7 +1,6 @@
-"""Loops that read the map: normal equations, samples at points.
+"""Loops that read the map: normal equations, samples.
 
-The sums equal ``cpu/registration.py``. Each thread adds a fixed set of pixels, and partial sums are added in order. Two
-runs on one device are therefore equal, unlike with atomic additions.
+As ``cpu/registration.py``; fixed partial sums make two runs equal, unlike atomic additions.
 """
 
 import warp as wp
@@ -28,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 NUM_SUMS = wp.constant(registration.NUM_SUMS)
 UNKNOWN, SURFACE, FREE = (wp.constant(wp.uint8(state)) for state in (states.UNKNOWN, states.SURFACE, states.FREE))
 LANES = wp.constant(128)
-"""Distance between the pixels of one partial sum: neighbouring threads read neighbouring pixels."""
+"""Distance between pixels of a partial sum."""
 Sums = wp.types.vector(registration.NUM_SUMS, wp.float32)
 Corners = wp.types.vector(8, wp.int32)
 
@@ -45,7 +44,7 @@ def word_at(lattice: Lattice, x: int, y: int, z: int):
 
 @wp.func
 def corners_at(lattice: Lattice, x: int, y: int, z: int):
-    """The eight packed voxels around a lattice point, corner 4 dx + 2 dy + dz."""
+    """Eight packed voxels around a lattice point, corner 4 dx + 2 dy + dz."""
     return Corners(
         word_at(lattice, x, y, z), word_at(lattice, x, y, z + 1),
         word_at(lattice, x, y + 1, z), word_at(lattice, x, y + 1, z + 1),
@@ -60,7 +59,7 @@ def linearize(
     voxel_size: wp.float32, sdf_unit: wp.float32, p: RegistrationParameters, per_thread: int,
     residuals: wp.array3d(dtype=wp.float32), partial: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Partial sums of the normal equations, and the residuals: see ``registration.linearize_rows``."""
+    """Partial sums and residuals: see ``registration.linearize_rows``."""
     thread = wp.tid()
     h, w = depth.shape[0], depth.shape[1]
     one, zero = wp.float32(1.0), wp.float32(0.0)
@@ -121,9 +120,7 @@ def linearize(
 
 @wp.kernel
 def add_up(partial: wp.array2d(dtype=wp.float32), groups: int, out: wp.array2d(dtype=wp.float64)):
-    """First level of the sum: each thread adds every ``groups``-th partial sum of one quantity, in order, in
-    float64.
-    """
+    """First level of the sum: every ``groups``-th partial sum, in order, float64."""
     k, group = wp.tid()
     total = wp.float64(0.0)
     for n in range(group, partial.shape[1], groups):
