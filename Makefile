@@ -15,7 +15,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --for
 # tests of one file share fixtures, so they stay in one process; no file takes more than a minute
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all costs ready check docs package processors soak fuzz fuzz-guided audit lock clean
+.PHONY: demo test test-all costs ready check docs pictures package processors soak fuzz fuzz-guided audit lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -44,6 +44,12 @@ check: .venv/developed
 
 docs: .venv/publishing
 	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+# all pictures of README and docs that show rendered worlds or pages; needs a Chromium
+pictures: .venv/developed
+	$(BIN)/python docs/pictures.py
+	$(BIN)/python docs/page_pictures.py
+	$(BIN)/python docs/moving_picture.py
 
 # sdist, wheel (from the sdist) without kernels, wheel with the kernels for this Python on Linux, and the latter in an
 # environment that has nothing but what it requires

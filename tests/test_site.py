@@ -11,6 +11,7 @@ import pytest
 import typer
 
 import dudmap
+from browsers import find_chromium
 from dudmap.cli import COMMANDS, application_of
 
 ROOT = Path(__file__).parent.parent
@@ -113,6 +114,10 @@ def test_pictures_are_small():
 @pytest.mark.parametrize(("script", "target", "written"), [
     ("pictures.py", ".", ["concept-labels.png", "concept-pose-graph.png", "concept-tsdf.png"]),
     ("moving_picture.py", "people.webp", ["people.webp"]),
+    pytest.param(
+        "page_pictures.py", ".", ["demo.jpg", "figures", "synthetic.jpg"],
+        marks=pytest.mark.skipif(not find_chromium(), reason="no Chromium"),
+    ),
 ])  # fmt: skip
 def test_the_pictures_can_be_drawn_again(script, target, written, tmp_path):
     done = subprocess.run([sys.executable, DOCS / script, target], cwd=tmp_path, capture_output=True, check=False)

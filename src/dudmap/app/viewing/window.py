@@ -31,8 +31,8 @@ PLOT_POINTS = 500
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
 CHANGE_COLORS = {"appeared": (60, 200, 90), "disappeared": (230, 60, 60)}
 PATH_COLOR, CAMERA_COLOR, KEYFRAME_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (120, 90, 200), (255, 200, 0)
-CAMERA_SIZE, KEYFRAME_SIZE = 0.25, 0.08
-"""Lengths of camera and keyframe pyramids, metres."""
+CAMERA_SIZE, KEYFRAME_SIZE, MARK_SIZE = 0.25, 0.08, 0.025
+"""Lengths of camera and keyframe pyramids, and radius of a marked point, metres."""
 LAYERS = {
     "map": "map", "path": "trajectory", "camera": "camera", "labels": "labels",
     "movers": "moving objects", "keyframes": "keyframes",
@@ -200,9 +200,10 @@ class Window:
             if len(self._marks) == 2:
                 text += f"; **{np.linalg.norm(ends[1] - ends[0]):.3f} m** from the point before"
             self._point.content = text
-            ends = ends.astype(np.float32)
-            self._add("/marks/points", "add_point_cloud", points=ends, colors=MARK_COLOR, point_size=0.02)
-            self._add("/marks/line", "add_line_segments", points=ends[None], colors=MARK_COLOR, thickness=0.006)
+            for number, end in enumerate(ends):
+                self._add(f"/marks/{number}", "add_icosphere", radius=MARK_SIZE, color=MARK_COLOR, position=end)
+            line = ends[None].astype(np.float32)
+            self._add("/marks/line", "add_line_segments", points=line, colors=MARK_COLOR, thickness=MARK_SIZE / 3)
 
     def stop(self) -> None:
         """End the server."""
