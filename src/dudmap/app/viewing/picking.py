@@ -26,5 +26,5 @@ def _distance(origin: NDArray[np.float64], direction: NDArray[np.float64], mesh:
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = np.einsum("ij,ij->i", from_a, across) / det, around @ direction / det
         t = np.einsum("ij,ij->i", c - a, around) / det
-    hit = (det > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+        hit = (det > 0) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
     return float(t[hit].min(initial=np.inf))
