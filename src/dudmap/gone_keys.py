@@ -94,7 +94,6 @@ def _is_gone(key: str, value: Any, size: Any) -> bool:  # noqa: ANN401 - TOML va
 
 
 def _is_scaled(key: str, value: Any, size: Any) -> bool:  # noqa: ANN401 - TOML values have many types
-    """Whether a value is the former default for a scene of ``size`` rooms."""
     if key not in LENGTHS or not all(isinstance(number, int | float) and number > 0 for number in (value, size)):
         return False
     scale = min(size, 1.0) if key.startswith("tracker.stop") else size ** LENGTHS[key]

@@ -347,7 +347,6 @@ def _print(figures: Figures, written: list[Path], *, as_json: bool, title: str, 
 
 
 def _shown(key: str, value: object) -> tuple[str, str]:
-    """Name and value; errors of a trajectory in millimetres and degrees."""
     match = re.fullmatch(r"((?:ate|rpe|drift|rotation)_\w+?)_(m|deg)(?:_per_(m|s))?", key)
     if not isinstance(value, float) or match is None:
         digits = 16 if key == "time_offset_s" else 6

@@ -262,7 +262,6 @@ class Slam(SlamResults, Stateful):
         )  # fmt: skip
 
     def _omitted(self, view: FrameView, prediction: PosePrediction) -> Shed:
-        """Work that is omitted from this frame, see ``shed``."""
         tracked = self._last is not None and self._last.status is Status.TRACKED
         self._omissions = 0 if not tracked or self._omissions >= 1 + (Shed.MOST in self.shed) else self._omissions + 1
         if self._omissions == 0:
@@ -272,7 +271,6 @@ class Slam(SlamResults, Stateful):
         return self.shed if carried and not self.predictor.mostly_dynamic else self.shed & ~Shed.LABELS
 
     def _rectified(self, view: FrameView) -> FrameView:
-        """The frame rectified to the time of its middle row."""
         with view.timer("rectify"):
             observation = self.color_motion.rectified(view.observation)
             if observation is view.observation:
@@ -408,7 +406,6 @@ class Slam(SlamResults, Stateful):
         return len(frames) > 1
 
     def _forget_map(self) -> None:
-        """Reset the state learnt from the frames of a map."""
         self.color_calibration.interrupt()
         for remembered in (self.monitor, self.detector, self.predictor.image_motion, self.redundancy):
             remembered.reset()

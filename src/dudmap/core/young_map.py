@@ -256,7 +256,6 @@ class YoungMap(Stateful):
         return sure
 
     def _motion(self, now: TrackedImage, frame: StartFrame, *, doubtful: bool) -> DominantMotion | None:
-        """Motion of the static world from an image to an older frame; None if unknown."""
         if frame.view.without_image:
             return None
         older = frame.view.tracked_at(frame.T_world_camera)
@@ -278,7 +277,6 @@ class YoungMap(Stateful):
         return replace(frame, T_world_camera=T, moving=propagate_to_segments(motion.after), undecided=undecided)
 
     def _contradicts(self, motion: DominantMotion, now: TrackedImage, older: StartFrame) -> bool:
-        """Whether the poses, or moving fused surface, contradict the map."""
         T = now.T_world_camera @ se3.inverse(motion.T_after_before)
         moving = propagate_to_segments(motion.after)
         hidden = moving if older.moving is None else moving & ~older.moving

@@ -234,7 +234,6 @@ def _occupied_cells(run: PlacedRun) -> tuple[NDArray[np.int64], NDArray[np.int64
 
 
 def _with_neighbours(codes: NDArray[np.int64], level: int) -> NDArray[np.int64]:
-    """Codes (n, 27) of cubes of ``2^level`` blocks and their neighbours."""
     coords = morton.decode(codes << (3 * level)) >> level
     return morton.encode((coords[:, None] + _AROUND) << level) >> (3 * level)
 

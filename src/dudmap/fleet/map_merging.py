@@ -74,7 +74,6 @@ def _agreeing(vote: tuple, votes: list[tuple]) -> list[tuple]:
 
 
 def _average(votes: list[tuple]) -> NDArray[np.float64]:
-    """Weighted mean of relative poses at the camera positions."""
     weights = np.array([vote[3] for vote in votes], float)
     Ts, cameras = np.stack([vote[1] for vote in votes]), np.stack([vote[2] for vote in votes])
     T = np.eye(4)

@@ -148,7 +148,6 @@ def calibrate_sequence(
 
 
 def _quick(config: Config, halvings: int) -> Config:
-    """Parameters for the excerpt."""
     preprocess = config.preprocess
     return config.override([
         "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",

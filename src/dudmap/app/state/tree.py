@@ -236,7 +236,6 @@ class TreeReader:
         return deque(items, node["limit"]) if kind is deque else kind(items) if kind in (tuple, set) else items
 
     def _named(self, content: Node, hints: dict[str, Any], kind: type, current: object = None) -> dict[str, Any]:
-        """Attributes by name, exactly as in ``hints``."""
         _check_names(content, hints, kind)
         out = {}
         for name, hint in hints.items():

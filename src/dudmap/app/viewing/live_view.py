@@ -119,7 +119,6 @@ class LiveView(RunObserver):
         return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))
 
     def _take(self) -> _Update | None:
-        """Wait for an update; None once all is shown."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._has_update())
             if not self._has_update():

@@ -69,7 +69,6 @@ class ReadoutSearch:
         self.sigma = min(error / bend.sum(), unknown) if bend.sum() > 0 else unknown
 
     def _fitted(self, readout: float) -> tuple[NDArray[np.float64], Calibration]:
-        """Costs (P,) for a readout in seconds, and the calibration with fitted timing."""
         pairs, start = self._rectified(readout), self._given.with_depth_readout(readout)
         fit, _ = self._adjustment.solve(pairs, Fit.tracked(pairs, start), self._free, self._adjustment.levels[-2:])
         return self._adjustment.costs(pairs, fit).sum(axis=0), fit.calibration

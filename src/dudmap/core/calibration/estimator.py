@@ -209,7 +209,6 @@ class CalibrationEstimator:
         return Estimate(found, evidence, gain, len(pairs))
 
     def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, float]:
-        """Vignetting, its standard deviation, and the evidence."""
         given = self.given.vignetting
         halves = [Brightness.of(pairs, fit) for pairs, fit in zip(proven.halves, proven.fits, strict=True)]
         found = [half.fitted()[0] for half in halves]

@@ -151,7 +151,6 @@ def _filtered(image: NDArray[np.float32], moving: NDArray[np.bool_]) -> NDArray[
 
 
 def _off_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose 3x3 neighbourhood has depth on one surface."""
     import cv2
 
     window = np.ones((3, 3), np.uint8)

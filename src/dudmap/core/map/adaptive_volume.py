@@ -62,7 +62,6 @@ class AdaptiveVolume(TsdfVolume):
         return self.all_blocks.parents
 
     def _parameters_of(self, n: int) -> FusionParameters:
-        """Parameters of a level, 0 = coarsest; distances have its steps."""
         if n == 0:
             return self.parameters
         finer = self.config.model_copy(update={"voxel_size": self.voxel_size / 2**n})
@@ -110,7 +109,6 @@ class AdaptiveVolume(TsdfVolume):
         return slots
 
     def _note_change(self, n: int, slots: NDArray[np.int32]) -> None:
-        """Mark blocks of a level (0 = coarsest) and the coarser blocks around them as changed."""
         for level in self.levels[:n][::-1]:
             level.blocks.written[slots] = self._frame_number
             slots = level.parents[slots]

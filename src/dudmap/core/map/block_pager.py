@@ -203,7 +203,6 @@ def regions_of(tree: BlockTree, pager: BlockPager | None) -> list[Region]:
 
 
 def _regions_of_entries(tree: BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Regions with blocks in memory, and the region number of each entry."""
     x, y, z = (tree.blocks.coords[: tree.blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
     packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)
     parts = [(packed >> shift) & 0xFFFF for shift in (32, 16, 0)]

@@ -151,7 +151,6 @@ def _corners(low: int, high: int) -> NDArray[np.int32]:
 
 
 def _touched(blocks: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
-    """Unique chunks that hold a voxel within ``reach`` blocks of these blocks."""
     chunks = ((blocks[:, None] + _corners(-reach, reach)) // EDGE).reshape(-1, 3).astype(np.int64)
     packed = ((chunks[:, 0] + (1 << 20)) << 42) | ((chunks[:, 1] + (1 << 20)) << 21) | (chunks[:, 2] + (1 << 20))
     unique = np.unique(packed)

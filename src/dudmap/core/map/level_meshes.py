@@ -78,7 +78,6 @@ def _records(coords: NDArray[np.int32], geometry: NDArray[np.int32], colors: NDA
 
 
 def _of_level(blocks: VoxelBlocks, content: BlockRecords) -> VoxelBlocks:
-    """Fill empty blocks with one level; slots are row numbers."""
     blocks.insert(content, 0)
     return blocks
 

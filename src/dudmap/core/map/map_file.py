@@ -147,7 +147,6 @@ def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> MapParamet
 
 
 def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:
-    """Blocks with smaller voxels, level by level."""
     levels, names = [], set(data)
     while f"slot_coords{len(levels) + 1}" in names:
         number = len(levels) + 1

@@ -59,7 +59,6 @@ def resident_bytes() -> int:
 
 
 def _return_freed() -> bool:
-    """Make the C library return freed memory to the system."""
     if sys.platform != "linux":
         return False
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc only

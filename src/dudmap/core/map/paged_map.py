@@ -99,7 +99,6 @@ class PagedMap(Stateful):
         self.window.fill(origin, self.blocks)
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
-        """Load the blocks from ``low`` up to ``high`` and all that touch them."""
         if self.pager is not None:
             self.pager.focus(self.all_blocks, low, high, self._frame_number)
 

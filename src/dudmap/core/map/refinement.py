@@ -80,7 +80,6 @@ def refine(
 def _drop_calm(
     level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Drop children that are no longer needed; returns whether a parent lost one."""
     rows, octants = np.nonzero(children >= 0)
     slots = children[rows, octants]
     calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)

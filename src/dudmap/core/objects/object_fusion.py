@@ -219,7 +219,6 @@ class ObjectFusion(Stateful):
         return replace(mover, velocity=times @ positions / np.sum(times**2))
 
     def _close(self, id: int) -> None:
-        """End the tracking of an object; its mesh is kept if it is rigid."""
         result, Ts = self._tracks.pop(id).result()
         self._closed.add(id)
         if result.rigid and sum(other.rigid for other, _ in self._results) >= MAX_MESHES:

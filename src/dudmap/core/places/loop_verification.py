@@ -133,7 +133,6 @@ class LoopVerifier:
 
 
 def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.float64]) -> float:
-    """Mean truncated distance, metres, of a frame's static measurements to a map."""
     level = query.levels[-1]
     weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
     volume.look_at(T_world_camera)

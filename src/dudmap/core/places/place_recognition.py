@@ -275,7 +275,6 @@ class KeyframeDatabase(Stateful):
         return [self.keyframes[n] for n in close.nonzero()[0] if self.keyframes[n].submap == submap]
 
     def _remove_most_redundant(self) -> None:
-        """Remove the older of the two nearest keyframes of one submap."""
         Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
         distance = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
         cosine = (np.einsum("iab,jab->ij", Ts[:, :3, :3], Ts[:, :3, :3]) - 1) / 2
@@ -287,7 +286,6 @@ class KeyframeDatabase(Stateful):
         del self.keyframes[int(np.unravel_index(np.argmin(gap), gap.shape)[0])]
 
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Largest plausible position error of a feature, metres."""
         z = points[:, 2]
         return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
 
@@ -313,7 +311,6 @@ def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterab
 
 
 def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
-    """Values (n, 9) of 3x3 neighbourhoods, clamped at the border."""
     u, v = np.rint(pixels).astype(np.int64).T
     offsets = np.arange(-1, 2)
     rows = np.clip(v[:, None, None] + offsets[:, None], 0, image.shape[0] - 1)
@@ -322,7 +319,6 @@ def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
 
 
 def _depth_at(depth: NDArray[np.float32], pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Median depth of 3x3 neighbourhoods, and whether they lie on one surface."""
     readings = _neighbourhood(depth, pixels)
     median = np.median(readings, axis=1)
     spread = readings.max(axis=1) - readings.min(axis=1)

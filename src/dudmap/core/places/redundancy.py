@@ -98,7 +98,6 @@ class RedundantViews(Stateful):
     def _known_share(
         self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Share of the surface information at each measurement that the map has; 0 off its surface."""
         volume.look_at(T_world_camera)
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = distance_sigma(self.config.sensor, level.depth, volume.voxel_size)

@@ -252,7 +252,6 @@ def _best(path: Path, series: list[Series], given: dict[str, Series]) -> Found:
 
 
 def _only(path: Path, kind: str, meant: list[Series]) -> Series:
-    """The one series that may be of a kind; an error names all."""
     different = list({id(one): one for one in meant}.values())
     if len(different) > 1:
         raise DatasetError(

@@ -141,7 +141,6 @@ def unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, NDArray[np.float32]]:
 
 
 def _texels(mesh: Mesh, uv: NDArray[np.float32], size: int) -> NDArray[np.int32]:
-    """Triangle (S, S) of each texel, -1 = none."""
     points = np.column_stack([uv * np.float32(size) - np.float32(0.5), np.ones(len(uv), np.float32)])
     numbers, distances = np.full((size, size), -1, np.int32), np.full((size, size), np.inf, np.float32)
     draw_triangles(points, mesh.faces, np.float32(PADDING / 2), numbers, distances)

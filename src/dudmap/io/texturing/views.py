@@ -317,7 +317,6 @@ def aligned(
 
 
 def _averaged(image: NDArray, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Means of squares of ``STRIDE`` pixels; ``size`` is their number across and down."""
     import cv2
 
     whole = image[: STRIDE * size[1], : STRIDE * size[0]]

@@ -264,7 +264,6 @@ def _moving(
 def _seen(
     points: NDArray[np.floating], calibration: Calibration, velocity: NDArray[np.float64], offset: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Pixels at which a second camera recorded points, and their depths; see ``Calibration``."""
     camera, at = calibration.camera, _moving(points, velocity)
     readout, delay = calibration.depth_readout + calibration.readout, np.float32(offset + calibration.delay)
     seen = _moved(calibration.T_color_depth, at(np.full(points.shape[1], -delay)))

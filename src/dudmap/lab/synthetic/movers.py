@@ -234,7 +234,6 @@ def _creeper(staging: Staging) -> list[SyntheticMover]:
 
 
 def _stopping(staging: Staging) -> list[SyntheticMover]:
-    """Cart that enters and stops in view permanently."""
     scene, speed = staging.scene, staging.pace(0.8)
     a, spot = np.asarray(scene.walk_line[0]), scene.rest[:2, 3]
     if staging.start_dynamic:
@@ -245,7 +244,6 @@ def _stopping(staging: Staging) -> list[SyntheticMover]:
 
 
 def _starting(staging: Staging) -> list[SyntheticMover]:
-    """Cart that stands in view and leaves in the second half."""
     scene, speed = staging.scene, staging.pace(0.8)
     b, spot = np.asarray(scene.walk_line[1]), scene.rest[:2, 3]
     begin = 0.4 if staging.start_dynamic else 0.5 * staging.duration
