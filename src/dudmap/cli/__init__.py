@@ -1,8 +1,8 @@
 """The command line: ``dudmap COMMAND``.
 
-A command is the function of its name in ``dudmap.cli.<command>``, or an application ``app`` there with subcommands. Its
-module is imported when the command is called, so that ``dudmap --help`` is fast. Errors are printed as one sentence.
-Exit codes: 1 error, 2 wrong usage, 3 useless run, 130 Ctrl-C, 143 SIGTERM, 129 SIGHUP.
+A command is the function of its name in ``dudmap.cli.<command>``, or an application ``app`` there, imported when
+called. Errors are printed as one sentence. Exit codes: 1 error, 2 wrong usage, 3 useless run, 130 Ctrl-C, 143 SIGTERM,
+129 SIGHUP.
 """
 
 import ctypes
@@ -44,7 +44,7 @@ COMMANDS = {
     "warmup": "Compile all kernels in advance.",
     "doctor": "Check the installation and name remedies.",
 }
-"""Name and one-line help of every command, in the order of the help page."""
+"""Name and one-line help of every command."""
 
 
 def application_of(name: str) -> typer.Typer:
@@ -58,14 +58,14 @@ def application_of(name: str) -> typer.Typer:
 
 
 USELESS = 3
-"""Exit code of a run that is complete and of no use."""
+"""Exit code of a complete, useless run."""
 
 _USAGE: type[Exception] = typer.BadParameter.__mro__[2]
-"""Base of the errors of wrong usage: ClickException, of click or of Typer itself."""
+"""Base of usage errors, of click or of Typer itself."""
 
 
 class CommandGroup(TyperGroup):
-    """Command group that imports a command when it is called, and prints errors as one sentence."""
+    """Command group that imports commands when called, and prints errors as one sentence."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
         """Replace the placeholder of the called command by the command itself."""

@@ -1,7 +1,7 @@
 """Compiled kernels: of the wheel, of a folder, or of this process.
 
 Numba refuses to define a kernel if none of its folders is writable. Kernels are then stored in a private temporary
-folder of this user, or compiled in memory.
+folder, or compiled in memory.
 """
 
 import os
@@ -165,7 +165,7 @@ _Cache._impl_class = _Impl
 
 @cache
 def _private() -> Path | None:
-    """Temporary folder of this user; no other user can add or replace a file."""
+    """Temporary folder that no other user can change."""
     try:
         base = Path(tempfile.gettempdir())
         temporary = {"/tmp", "/var/tmp", *(os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP"))}

@@ -16,8 +16,8 @@ PLAIN = (bool, int, float, complex, str, bytes, np.generic, type(None))
 
 
 def digest(kernel: Any) -> str:  # noqa: ANN401 - a dispatcher of Numba
-    """Digest of a kernel: code, options, and all functions and constants that it reads, recursively; not comments,
-    docstrings and line numbers."""
+    """Digest of a kernel: code, options, and all functions and constants that it reads; not comments, docstrings and
+    line numbers."""
     return hashlib.sha256("\n".join(sorted(reached(kernel).values())).encode()).hexdigest()
 
 

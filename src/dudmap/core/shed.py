@@ -1,4 +1,4 @@
-"""Work that is omitted from a frame without time for it."""
+"""Work omitted from a frame without time for it."""
 
 from enum import IntFlag
 

@@ -55,13 +55,13 @@ class Slam(SlamResults, Stateful):
     Args:
         camera: Camera of the frames.
         config: All parameters; None for the defaults.
-        first_pass: A system that has processed the whole recording. Frames are registered and labelled with its map and
-            fused into a new one, without objects that seemed static before they moved.
+        first_pass: A system that has processed the recording. Frames are registered and labelled with its map and fused
+            into a new one, without objects that moved later.
         calibration: Calibration of the colour camera; None for registered colour. With ``sensor.self_calibration``, one
             that is not estimated starts the estimation.
         live: No frame waits for a calibration, and the first poses are not refined.
         saved_map: Map of an earlier run to continue, taken over with its world frame. Frames are lost until one is
-            recognised in it, or a new submap starts, which may be joined later.
+            recognised in it, or a new submap starts.
         localize: Only find the camera in ``saved_map``; the map does not change.
         max_blocks: Largest number of blocks in memory, or memory limit of the process; None for none. Results do not
             change.
@@ -281,8 +281,8 @@ class Slam(SlamResults, Stateful):
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the frame before, or its depth.
 
-        It has the repeated pose, or with new colours the predicted pose until the next frame is tracked. Neither
-        outlasts the validity of predictions.
+        It has the repeated pose, or with new colours the predicted pose until the next frame is tracked, while
+        predictions are valid.
         """
         depth_only, time, drift = self.stream.repeats == "depth", view.timestamp, self.motion.drift(view.timestamp)
         images = "the depth image" if depth_only else "both images"

@@ -1,6 +1,6 @@
 """State that a system keeps between frames, for checkpoints.
 
-Attributes marked as ``Remembered`` in a ``Stateful`` class are the state: plain values, arrays, dataclasses and named
+Attributes marked as ``Remembered`` in a ``Stateful`` class are the state: plain values, arrays, dataclasses, named
 tuples. Their annotations define how they are stored (``app/state/tree.py``). Back ends, threads, caches and derived
 values are no state.
 """

@@ -1,8 +1,8 @@
 """The first frames of a map: their static world is decided when slow motion is visible.
 
 The first frame is fused as a whole, the next ones without the motion between consecutive images. After UNDECIDED
-seconds, ``YoungMap.decide`` compares them over longer times. If fused surface has moved, or the poses followed a crowd,
-the frames are registered and fused again (``Slam._replay``).
+seconds, ``YoungMap.decide`` compares them over longer times. If fused surface has moved, or poses followed a crowd, the
+frames are registered and fused again (``Slam._replay``).
 """
 
 from dataclasses import dataclass, replace
@@ -195,9 +195,8 @@ class YoungMap(Stateful):
     def decide(self, now: TrackedImage) -> list[StartFrame]:
         """Decide the static world of the first frames: fast motion with the second frame, slow motion after UNDECIDED.
 
-        Backwards in time, hop by hop: find a reference, the oldest frame with a sure comparison (``_reference``);
-        compare the frames after it, without the pixels that move between reference and present image; continue from the
-        reference.
+        Backwards, hop by hop: find the oldest frame with a sure comparison (``_reference``); compare the frames after
+        it, without pixels that move in between; continue from it.
 
         Args:
             now: The present image at its predicted pose, with its known moving pixels.
@@ -265,10 +264,7 @@ class YoungMap(Stateful):
         return now.timestamp - frame.view.timestamp < 1.5 * self._interval
 
     def _compared(self, now: TrackedImage, frame: StartFrame) -> StartFrame | None:
-        """An older frame as its comparison with an image shows it; None if unknown.
-
-        In a crowd that was too slow for consecutive images, pixels not verified as static are undecided.
-        """
+        """An older frame as its comparison with an image shows it; None if unknown."""
         motion = self._motion(now, frame, doubtful=False)
         if motion is None:
             return None
@@ -306,8 +302,7 @@ class YoungMap(Stateful):
 
 
 def _drags_smoothly(frames: list[StartFrame]) -> bool:
-    """Whether people can have dragged the camera away from the revised poses, at most at FASTEST. A wrong reference
-    moves its whole hop at once."""
+    """Whether people can have dragged the camera away from the revised poses, at most at FASTEST."""
     if len(frames) == 1:
         return True
     moved = [f.T_world_camera[:3, 3] - f.estimate.T_world_camera[:3, 3] for f in frames[1:]]

@@ -1,8 +1,7 @@
 """Compiles the kernels of a wheel: ``python -m dudmap.lab.wheel_kernels FOLDER`` (``make package``).
 
-The first process runs every part of the system on a few small images, for the lowest level, and notes the argument
-types of each kernel. The others compile the same kernels for the other levels without running them, so that the machine
-needs the lowest level only.
+The first process runs every part on small images, for the lowest level, and notes argument types. The others compile
+the same kernels for other levels without running them.
 """
 
 import hashlib
@@ -27,7 +26,7 @@ SHIPPED = "x86-64-v3", "x86-64-v4"
 
 
 def kernels() -> Iterator[tuple[str, str, Dispatcher]]:
-    """Module, name and dispatcher of all kernels of this process that were called."""
+    """Module, name and dispatcher of all called kernels."""
     found = set[int]()
     for module in [name for name in sys.modules if name.startswith("dudmap.")]:
         for name, value in vars(sys.modules[module]).items():
@@ -46,9 +45,9 @@ def export(kernel: Dispatcher, folder: Path) -> None:
 
 
 def compile_level(noted: Path, folder: Path) -> None:
-    """Compile all kernels for the processor in Numba's settings, and write them into a folder.
+    """Compile all kernels for Numba's processor, and write them into a folder.
 
-    ``noted`` is the file of the argument types; the first process writes it, the others read it.
+    ``noted``: file of argument types, written by the first process.
     """
     if noted.exists():
         for module, name, signatures in pickle.loads(noted.read_bytes()):
@@ -66,7 +65,7 @@ def compile_level(noted: Path, folder: Path) -> None:
 
 
 def main(out: Path) -> None:
-    """Compile for each level in a separate process, whose Numba ignores the present processor."""
+    """Compile for each level in a separate process."""
     with tempfile.TemporaryDirectory() as temporary:
         for level in SHIPPED:
             folder = out / shipped_kernels.VERSIONS / level

@@ -1,8 +1,7 @@
 """Map with several voxel sizes (thesis section 7.1).
 
-The blocks of ``TsdfVolume`` cover everything observed and alone hold free space. Finer blocks, with a half and a
-quarter of the voxel size, refine them near detail (``refinement.py``). An observed finer voxel replaces the coarser
-one.
+The blocks of ``TsdfVolume`` cover everything observed and alone hold free space. Finer blocks, of a half and a quarter
+of the voxel size, refine them near detail (``refinement.py``); observed finer voxels replace coarser ones.
 """
 
 import numpy as np

@@ -28,7 +28,7 @@ Region = tuple[int, int, int]
 
 
 class Away(NamedTuple):
-    """A region in the store: serial number, and numbers of blocks, of blocks with voxels, and of finer blocks."""
+    """A region on disk: serial number, and numbers of blocks, of blocks with voxels, and of finer blocks."""
 
     serial: int
     blocks: int
@@ -37,11 +37,10 @@ class Away(NamedTuple):
 
 
 class BlockPager(Stateful):
-    """Moves regions of a map between memory and disk, without a change of content. A region takes a few milliseconds.
+    """Moves regions of a map between memory and disk, without a change of content.
 
     Attributes:
-        max_blocks: Largest number of blocks with voxels in memory, of all levels, or a limit evaluated each time.
-            Blocks in view stay.
+        max_blocks: Limit of blocks with voxels in memory, of all levels; blocks in view stay.
         failure: Why the last write failed; empty on success. The regions then stay in memory.
     """
 
@@ -103,8 +102,8 @@ class BlockPager(Stateful):
         self._returned.pop(_key(first >> REGION_BITS), None)
 
     def focus(self, tree: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
-        """Load all blocks of the box from ``low`` to ``high`` (3,) and ``MARGIN`` around it. The farthest regions leave
-        if there are too many; entries are then renumbered."""
+        """Load the box from ``low`` to ``high`` (3,) and ``MARGIN`` around it. The farthest regions leave if there are
+        too many; entries are then renumbered."""
         first = (low.astype(np.int64) - MARGIN) >> REGION_BITS
         last = (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS
         wanted = self._stored_in(first, last) if self._away else []
@@ -162,8 +161,7 @@ class BlockPager(Stateful):
         leaving: NDArray[np.bool_],
         frame_number: int,
     ) -> bool:
-        """Write the leaving regions; after a failure none has left. ``region_of``: region of each entry, which the
-        caller removes."""
+        """Write the leaving regions; after a failure none has left."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
         voxel_blocks = np.bincount(region_of, tree.blocks.slot_of[: tree.blocks.num_entries] >= 0, minlength=len(keys))

@@ -14,8 +14,7 @@ MARGIN = 3
 """Blocks that the view may move before the window follows."""
 
 LOCAL_GRID = 4096
-"""Spacing of the local origins, blocks: at most 164 m away with blocks of 8 cm, so that float32 resolves 15
-micrometres."""
+"""Spacing of local origins, blocks: at most 164 m with blocks of 8 cm, where float32 resolves 15 micrometres."""
 
 
 class BlockWindow(Stateful):
@@ -24,7 +23,7 @@ class BlockWindow(Stateful):
     Attributes:
         block_size: Metres.
         shape: (3,) int64, blocks along each axis, at least the requested ``cells``.
-        cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
+        cells: (Wx * Wy * Wz,) int32: slot; -1 = unknown; -2 - entry without voxels.
         mirror: ``cells`` for back ends, which may hold a copy on a device.
         stamps: Shape of ``cells``, last frame whose truncation band touched the block.
         near: (n,) int32, slots inside the window.

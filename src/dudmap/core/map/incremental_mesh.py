@@ -17,8 +17,8 @@ GROWTH = 4
 class VolumeMirror:
     """Copy of a volume, updated by the blocks written since the last copy.
 
-    ``update`` runs in the thread that changes the volume. Between updates any thread may read the copy ``volume``,
-    whose frames count the updates.
+    ``update`` runs in the thread that changes the volume. Between updates any thread may read ``volume``, whose frames
+    count the updates.
     """
 
     def __init__(self, volume: TsdfVolume) -> None:
@@ -34,8 +34,8 @@ class VolumeMirror:
         self._copied = [np.zeros(0, dtype=np.int32) for _ in range(levels)]  # frame up to which each slot was copied
 
     def update(self, limit: int | None = None) -> None:
-        """Copy at most ``limit`` blocks of the coarsest level written since the last update, the least recently copied
-        first; None copies all."""
+        """Copy at most ``limit`` blocks of the coarsest level written since, least recently copied first; None copies
+        all."""
         if self._source.map_id != self.volume.map_id:  # the map was cleared
             self._start()
         source, target = self._source.blocks, self.volume.blocks
@@ -76,9 +76,8 @@ Chunk = tuple[int, int, int]
 class IncrementalMesh:
     """Mesh of a growing volume for a live view.
 
-    An update extracts the chunks of 4x4x4 blocks that touch a block written since the last update; its time grows with
-    the view, not with the map. The chunks equal ``TsdfVolume.extract_mesh`` with duplicate vertices between them. Not
-    during ``integrate``.
+    An update extracts the chunks of 4x4x4 blocks that touch a written block; its time grows with the view. The chunks
+    equal ``TsdfVolume.extract_mesh`` with duplicate vertices between them. Not during ``integrate``.
 
     ``chunks``: meshes by chunk coordinates; chunk (i, j, k) begins at block (4 i, 4 j, 4 k).
     """
@@ -93,8 +92,8 @@ class IncrementalMesh:
         self._reach = 2 if volume.levels else 1
 
     def update(self) -> list[Chunk]:
-        """Extract the changed chunks, and return the coordinates of all that may have changed; missing in ``chunks`` =
-        no surface any more."""
+        """Extract the changed chunks, and return the coordinates of all that may have changed, also without surface
+        now."""
         removed: list[Chunk] = []
         if self._volume.map_id != self._map_id:  # the map was cleared: its frame numbers restart
             removed = list(self.chunks)

@@ -1,8 +1,7 @@
 """Mesh of a map with several voxel sizes: marching cubes level by level, on one field.
 
-A lattice point has the value of the smallest voxel observed there. At the border of a level its voxels interpolate the
-coarser level, so that both surfaces share their points on the edges of the larger cells; inside their faces they differ
-by the curvature of the field.
+A lattice point has the value of the smallest voxel observed there. Voxels at the border of a level interpolate the
+coarser one: both surfaces share points on edges of larger cells, and differ inside faces by the curvature.
 """
 
 from collections.abc import Sequence

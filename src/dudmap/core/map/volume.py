@@ -91,8 +91,8 @@ class TsdfVolume(PagedMap):
         sensor: Noise of the depth measurements.
         depth_max: Largest integrated depth, metres.
         backend: Compute device of this map alone; None takes the CPU.
-        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process; the farthest are
-            paged to disk. None keeps all.
+        max_blocks: Blocks with voxels in memory, or the process' memory limit; the farthest are paged to disk. None
+            keeps all.
         extent: Depth of the window, metres; None = ``depth_max``.
 
     Attributes:
@@ -287,9 +287,8 @@ class TsdfVolume(PagedMap):
     ) -> NDArray[np.float32]:
         """Share of the surface information at each depth pixel (h, w) that the map already has.
 
-        An average of total weight w has a variance proportional to 1 / w (eq. 4.19), and 1 / (w + g) with one more
-        measurement of weight g. The share is w / (w + g): n / (n + 1) after n equal measurements. 0 without depth or
-        surface.
+        An average of weight w has a variance proportional to 1 / w (eq. 4.19), and 1 / (w + g) with one more
+        measurement. The share is w / (w + g): n / (n + 1) after n equal measurements. 0 without depth or surface.
         """
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))

@@ -1,4 +1,4 @@
-"""Moving objects of a recording: identity and velocity of all, shape and trajectory of rigid objects."""
+"""Moving objects of a recording: identity, velocity, and shape of rigid ones."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -18,12 +18,12 @@ from dudmap.core.state import Remembered, Stateful
 from dudmap.core.tracking.frame_view import FrameView, PoseEstimate
 
 MOST_WAITING = 30
-"""Largest number of frames whose moving objects wait to be computed: 0.2 MB each."""
+"""Frames whose moving objects wait: 0.2 MB each."""
 
 
 @dataclass(eq=False)
 class _Frame:
-    """A tracked frame: arguments of ``ObjectTracker.update``, and its objects once computed."""
+    """A tracked frame, and its objects once computed."""
 
     timestamp: float
     dynamic: NDArray[np.bool_]
@@ -33,8 +33,7 @@ class _Frame:
 
 
 class MovingObjects(Stateful):
-    """Tracks the objects that are labelled as moving, without influence on pose or map; ``movers`` of the
-    configuration switches it."""
+    """Tracks moving objects, without influence on pose or map; ``movers`` of the configuration switches it."""
 
     tracker: Remembered[ObjectTracker | None]
     fusion: Remembered[ObjectFusion | None]
@@ -47,10 +46,9 @@ class MovingObjects(Stateful):
         self._finding = Lock()
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
-        """Record a tracked frame; the returned function computes its moving objects, sorted by id, in any thread.
+        """Record a tracked frame; the returned function computes its moving objects, sorted by id, in any thread,
 
-        It also computes the objects of all earlier frames; of these at most ``MOST_WAITING`` wait. With fusion, objects
-        are computed at once.
+        after earlier frames, of which at most ``MOST_WAITING`` wait. With fusion, objects are computed at once.
         """
         if self.tracker is None or estimate.labels is None:
             return tuple
@@ -79,5 +77,5 @@ class MovingObjects(Stateful):
         return frame.movers
 
     def rigid_objects(self, Ts_world_camera: Mapping[float, NDArray[np.float64]]) -> list[RigidObject]:
-        """Shape and trajectory of the objects so far, given the camera poses (4, 4) by time; empty without fusion."""
+        """Shape and trajectory of objects so far, by camera poses (4, 4) by time; empty without fusion."""
         return [] if self.fusion is None else self.fusion.objects(dict(Ts_world_camera))

@@ -31,9 +31,8 @@ from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 class TimedPose:
     """Pose (4, 4) of a frame in the world of a submap; timestamp in seconds.
 
-    ``repeats``: "" for a tracked frame; "depth" for a predicted pose of a repeated depth image; "frame" for a copied or
-    interpolated pose. ``late``: seconds from capture to time stamp of the depth image, by the calibration at tracking
-    time.
+    ``repeats``: "" for a tracked frame; "depth" for a predicted pose; "frame" for a copied or interpolated one.
+    ``late``: seconds from capture to time stamp of the depth image, by the calibration at tracking time.
     """
 
     timestamp: float
@@ -49,8 +48,8 @@ class Atlas(Stateful):
     Attributes:
         keyframes: Keyframes of all submaps.
         depth_late: Delay of the depth time stamps, seconds.
-        saved: Number of the submap that began as a saved map, or None. Other submaps are joined to it, and loop
-            closures do not change it, because not all its frames are stored.
+        saved: Number of the submap that began as a saved map, or None. Others are joined to it, and loop closures do
+            not change it.
     """
 
     history: Remembered[FrameStore | None]
@@ -88,8 +87,8 @@ class Atlas(Stateful):
         *,
         keep_frames: bool,
     ) -> "Atlas":
-        """An atlas with one empty map. ``keep_frames``: store frames for corrections if the configuration needs them. A
-        ``prior`` map of a first pass provides the keyframes; no frames are stored then."""
+        """An atlas with one empty map. ``keep_frames``: store frames for corrections if needed. A ``prior`` map of a
+        first pass provides keyframes; no frames are stored then."""
         if prior is not None:
             return cls(make_volume, prior.keyframes, None, prior.submap)
         keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
@@ -130,8 +129,7 @@ class Atlas(Stateful):
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 
     def recolor(self) -> None:
-        """Repaint all maps but a saved one from the stored frames under the present calibration, the current one during
-        the next frames."""
+        """Repaint all maps but a saved one under the present calibration, the current one during the next frames."""
         assert self.history is not None
         self.complete()
         for number in self.volumes:

@@ -1,6 +1,6 @@
 """Removal of stored images that newer frames replace: their number grows with space, not time.
 
-In a running average with a capped weight only the newest measurements count. The pose stays in the pose graph.
+The pose stays in the pose graph.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ MIN_KEPT = 256
 class FrameThinning(Stateful):
     """Removes the images of frames of the current submap whose view newer frames show (SAME_DISTANCE, SAME_ANGLE_DEG).
 
-    * They fill every cell that the frame was fused in, which keeps background behind an object: more than
-      ``similarity.threshold`` of the measurements of a running average.
+    * They fill every cell that the frame was fused in, with more than ``similarity.threshold`` of the measurements of a
+      running average.
     * At least LOCAL_FRAMES of them were stored before any nearby keyframe was last seen, for loop verification.
     """
 

@@ -51,10 +51,9 @@ class LoopSearch:
 class LoopCloser(Stateful):
     """Detects, verifies and closes loops, and joins submaps.
 
-    Features (3D-3D RANSAC), and distances and intensities of the local map of the matched time, must give the same
-    camera pose. A second frame must confirm the correction, and the newest frame must not be registered to the older
-    surfaces. Matching runs in the background and is evaluated ``CHECK_INTERVAL`` frames later, independent of timing.
-    ``closed`` counts corrections and joins.
+    Features (3D-3D RANSAC), distances and intensities of the local map must give the same pose. A second frame must
+    confirm the correction, and the newest must not be registered to the older surfaces. Matching is evaluated
+    ``CHECK_INTERVAL`` frames later, independent of timing. ``closed`` counts corrections and joins.
     """
 
     corrector: Remembered[LoopCorrector]

@@ -19,8 +19,8 @@ ODOMETRY_NOISE = 0.002, 0.02
 LOOP_NOISE = 0.005, 0.003
 """Standard deviation of a loop closure: reference depths and radians."""
 MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
-"""Largest misfit of the new pass to the old map: ratio times the misfit to its own map, plus offset (reference depths;
-intensities 0..1). Measured: correct corrections have 1.1; errors of 5 cm, or of 2 cm and 1 degree, more than 2."""
+"""Largest misfit of the new pass to the old map: ratio times its misfit to its own map, plus offset (reference depths;
+intensities 0..1). Correct corrections have 1.1; errors of 5 cm, or of 2 cm and 1 degree, more than 2."""
 
 
 class LoopCorrector(Stateful):
@@ -129,7 +129,7 @@ def _passes(
 ) -> tuple[list[int], list[int]]:
     """Indices of the ``kept`` poses of a path that view the place of pose ``b``, of the old and the new pass.
 
-    The old pass of the loop ``a`` to ``b`` ends at the farthest point from ``b``. Both passes have about as many poses.
+    The old pass of the loop ``a`` to ``b`` ends at the farthest point from ``b``.
     """
     farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b], unit))), 1), len(Ts) - 1)
     before, after = kept[kept < farthest], kept[kept >= farthest]

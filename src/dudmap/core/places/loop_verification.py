@@ -29,8 +29,7 @@ LOCAL_FRAMES = 8
 LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
 """Largest distance (reference depths) and angle (deg) of these frames from the pose."""
 DRIFT_ALLOWANCE, DRIFT_SHARE = 0.05, 0.1
-"""Plausible drift after any path, reference depths and radians, and as a share of the path; 1 rad counts as one
-reference depth."""
+"""Plausible drift after any path, reference depths and radians, and as a share of the path."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +90,7 @@ class LoopVerifier:
     def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
         """Whether a correction improves the fit of the newest frame to the map of the place.
 
-        Registration can return to the older surfaces by itself; a correction would then displace the camera. The older
-        pass are the frames stored before the farthest point of the path. True if none of them is near.
+        The older pass are the frames stored before the farthest point of the path. True if none of them is near.
         """
         T_tracked = newest.tracking.T_world_camera
         T_corrected = T_corrected_tracked @ T_tracked

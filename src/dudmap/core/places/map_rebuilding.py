@@ -20,7 +20,7 @@ PER_FRAME = 2
 MAX_ADDED = 8
 """Stored frames added at once around a candidate pose of a lost camera."""
 VIEW_DEPTH = 2.0
-"""Depth of the view point, by which views are compared, reference depths: middle of an indoor view."""
+"""Depth of the view point that stands for a view, reference depths."""
 NEAR = 3.0
 """Largest distance of an added frame's view point from the camera's, reference depths."""
 SPACING = 0.3

@@ -177,8 +177,8 @@ class KeyframeDatabase(Stateful):
         dynamic_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> bool:
-        """Make a tracked frame a keyframe if none of its submap is near and ``relocalization.keyframe_gap`` tracked
-        frames have passed; call with every tracked frame.
+        """Make a tracked frame a keyframe if none of its submap is near and ``relocalization.keyframe_gap`` frames have
+        passed; call with every tracked frame.
 
         ``settle`` removes it if it has fewer than ``MIN_INLIERS`` features.
         """
@@ -295,11 +295,7 @@ def _nothing() -> None:
 
 
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
-    """The keyframes whose strongest features are most similar, best first.
-
-    A score sums the excess of a feature's best cosine similarity over the median of all keyframes, so that features of
-    many places do not count.
-    """
+    """The keyframes whose strongest features are most similar, best first."""
     if len(among) <= MAX_MATCHED:
         return among
     parts = [keyframe.features.descriptors[:COARSE_FEATURES] for keyframe in among]

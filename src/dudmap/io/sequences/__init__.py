@@ -1,4 +1,4 @@
-"""Readers of recordings: one small class per format, all with the interface ``Sequence``."""
+"""Readers of recordings: one class per format with the interface ``Sequence``."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
@@ -29,11 +29,11 @@ class Sequence(Protocol):
     """A recording with random access to its frames.
 
     Attributes:
-        name: Short name, usable as a folder name.
-        camera: Intrinsics of the depth images, and of registered colour images.
-        calibration: Of the colour camera; None for colour that is registered to depth.
-        timestamps: (N,) float64 strictly increasing timestamps of the depth images, seconds.
-        ground_truth: True camera poses if known; used for evaluation only.
+        name: Short name, for folders.
+        camera: Of the depth images, and of registered colour.
+        calibration: Of the colour camera; None for registered colour.
+        timestamps: (N,) float64 strictly increasing, of the depth images, seconds.
+        ground_truth: True camera poses if known, for evaluation only.
     """
 
     @property
@@ -55,45 +55,44 @@ class Sequence(Protocol):
         """Frame number ``index``.
 
         Raises:
-            FrameError: This frame cannot be read; the others may be valid.
+            FrameError: It cannot be read; others may be valid.
         """
         ...
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame if known; used for evaluation only."""
+        """True dynamic mask (H, W) of a frame if known, for evaluation only."""
         ...
 
 
 class Recording(ABC):
-    """A ``Sequence`` on disk: recognises its format, opens a folder or file of it, and reads a frame on access.
+    """A ``Sequence`` on disk, which reads a frame on access.
 
-    A format sets times, cameras and sources in its constructor, which raises a ``DatasetError`` for a damaged recording
-    and a ``MissingExtraError`` without its package. ``_frame`` reads a frame.
+    A format sets times, cameras and sources in its constructor, which raises a ``DatasetError`` for damage and a
+    ``MissingExtraError`` without its package; ``_frame`` reads a frame.
 
     Args:
         path: The folder or file.
-        camera: Intrinsics of the depth images, which replace the recording's intrinsics.
+        camera: Intrinsics that replace the recording's.
 
     Attributes:
-        format: Name of the format, for people.
+        format: Name for people.
         options: Options of ``open_sequence`` that the format has.
-        sources: Origin of ``intrinsics``, ``depth unit`` and ``times``: a file, a data set's name, an option, or an
-            assumption.
-        remarks: Sentences on omitted data and on assumptions.
-        timed: Whether the times were read or their rate was given; False for assumed times.
-        has_color: False if the ``color`` of all frames is None.
-        gravity: Measured directions against gravity, or None; reading them may raise a ``DatasetError``.
-        opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
+        sources: Origin of ``intrinsics``, ``depth unit`` and ``times``.
+        remarks: Sentences on omitted data and assumptions.
+        timed: False for assumed times.
+        has_color: False without colour in all frames.
+        gravity: Measured directions against gravity, or None; reading may raise a ``DatasetError``.
+        opened: Arguments of ``open_sequence`` that open it again.
     """
 
     format = ""
     options: tuple[str, ...] = ()
     truth = ""
-    """Conversion of the published poses, unless they are camera poses in dudmap's axes."""
+    """Conversion of published poses, if any."""
     suffix = ""
     """Suffix of single files."""
     layout: tuple[str, ...] = ()
-    """Patterns of files and folders in every folder of the format."""
+    """Patterns of files and folders of the format."""
     timed = True
     has_color = True
     camera: Camera
@@ -111,7 +110,7 @@ class Recording(ABC):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether an existing path has this format, by names and first bytes only."""
+        """Whether a path has this format, by names and first bytes."""
         if cls.suffix:
             return path.suffix.lower() == cls.suffix and path.is_file()
         return path.is_dir() and all(any(path.glob(pattern)) for pattern in cls.layout)
@@ -126,7 +125,7 @@ class Recording(ABC):
         """Frame number ``index``.
 
         Raises:
-            FrameError: An image is missing, damaged, or has another size than its camera.
+            FrameError: An image is missing, damaged, or of another size.
         """
         index = range(len(self))[index]
         name = f"frame {index} of {self.path}"
@@ -134,11 +133,11 @@ class Recording(ABC):
             return self._frame(index, name)
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame, None if it is not known."""
+        """True dynamic mask (H, W) of a frame, or None."""
         return None
 
     def set_depth_unit(self, unit: float) -> None:
-        """Replace the metres per unit of the 16-bit depth images."""
+        """Replace the metres per unit of 16-bit depth."""
         self.camera = replace(self.camera, depth_scale=1.0 / unit)
         self.sources["depth unit"] = f"--depth-unit {unit:g}"
 
@@ -182,7 +181,7 @@ READERS = (
     "bag:RealSenseRecording",
     "bag:RosBag",
 )
-"""Module and class of every reader in the order of the attempts: specific layouts first."""
+"""Module and class of every reader, specific layouts first."""
 NUMBERED = READERS.index("numbered:NumberedSequence")
 MOST_NAMES = 5
 DEPTH_OF_SEARCH = 3
@@ -190,25 +189,25 @@ DEPTH_OF_SEARCH = 3
 
 @cache
 def readers() -> tuple[type[Recording], ...]:
-    """Readers of all formats, in the order of the attempts."""
+    """Readers of all formats, in order."""
     names = (reader.split(":") for reader in READERS)
     return tuple(getattr(import_module(f"dudmap.io.sequences.{module}"), name) for module, name in names)
 
 
 def reader_of(path: Path) -> type[Recording] | None:
-    """First reader that recognises an existing path, or None."""
+    """First reader of a path, or None."""
     return next((reader for reader in readers() if reader.recognises(path)), None)
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a folder or file is a recording of a known format, or an archive."""
+    """Whether a path is a known recording or an archive."""
     from dudmap.io.sequences.archive import is_archive
 
     return path.exists() and (reader_of(path) is not None or is_archive(path))
 
 
 def is_timed(sequence: object) -> bool:
-    """Whether the times of a sequence are known, not only frame numbers."""
+    """Whether the times of a sequence are known."""
     return getattr(sequence, "timed", True)
 
 
@@ -218,10 +217,10 @@ def has_color(sequence: object) -> bool:
 
 
 def read_frame(sequence: "Sequence", index: int) -> Frame:
-    """Read a frame into its own memory, because a user's class may reuse its images for every frame.
+    """Read a frame into its own memory, because a user's class may reuse its images.
 
     Raises:
-        FrameError: This frame cannot be read; the others may be valid.
+        FrameError: It cannot be read; others may be valid.
     """
     frame = sequence[index]
     return frame if isinstance(sequence, Recording) else frame.copy()
@@ -234,23 +233,21 @@ def open_sequence(
     depth_unit: float | None = None,
     **options: Any,  # noqa: ANN401
 ) -> Recording:
-    """Open a recording with the first reader of ``readers()`` that recognises it.
+    """Open a recording with the first of ``readers()`` that recognises it, also inside a folder.
 
-    A folder may contain the recording. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is unpacked into a
-    cache first; ``archive.zip/folder`` names one of several recordings in it.
+    An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is unpacked into a cache first; ``archive.zip/folder``
+    names one of several recordings in it.
 
     Args:
         path: Folder, file or archive.
-        camera: Intrinsics that replace the recording's: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
-            Defaults: the size of the images, and the format's usual depth scale.
-        fps: Frames per second of a recording without times; default 30.
-        depth_unit: Metres per unit of the 16-bit depth images, such as 0.001; replaces the unit of camera and
-            recording.
-        options: Of one format, e.g. ``topics`` of bags; None means not given.
+        camera: Replaces the recording's: a Camera, or ``fx,fy,cx,cy[,w,h[,depth_scale]]``, by default with the images'
+            size and the format's depth scale.
+        fps: Of a recording without times; default 30.
+        depth_unit: Metres per 16-bit unit, such as 0.001; replaces other units.
+        options: Of one format, e.g. ``topics`` of bags; None: not given.
 
     Raises:
-        DatasetError: The path does not exist, has no known format or several recordings, is damaged, or the format
-            lacks an option.
+        DatasetError: No path, no known format, several recordings, damage, or an unknown option.
     """
     path = Path(path)
     with damaged(DatasetError, f"the recording {path}"):
@@ -330,7 +327,7 @@ def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording]
 
 
 def _places_by_content(path: Path) -> list[Path]:
-    """Folders whose content is depth and colour images, else depth alone."""
+    """Folders of depth and colour images by content, else depth alone."""
     from dudmap.io.sequences.image_series import alone, by_content, unknown
 
     def search(place: Path, kinds: Callable[[Path], dict], levels: int) -> list[Path]:
