@@ -195,7 +195,7 @@ class TrueSurface(NamedTuple):
 
 
 def true_surface(folder: Path) -> TrueSurface | None:
-    """surface.ply with perhaps surface_observed.ply, or the data set's model."""
+    """True surface of a folder: surface.ply with perhaps surface_observed.ply, or the data set's model."""
     path, seen = folder / "surface.ply", folder / "surface_observed.ply"
     if path.is_file():
         observed = load_mesh(seen) if seen.is_file() else None

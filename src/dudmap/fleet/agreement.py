@@ -27,7 +27,7 @@ MAX_DENIED = 0.01
 """Largest share of compared surface in the other's free space. Measured: 0 to 0.006 for one place, 0.0185 to 0.12 for
 moved furniture, 0.006 to 0.024 for similar floors."""
 MAX_CHANGED = 0.5
-"""The same for two visits with changes."""
+"""Largest denied share of two visits with changes."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
 """Correlation of intensities, and share of cells with agreeing colours: 0.995 and 1.0 for one rendered room; 0.86 and
 0.80 with other small textures."""

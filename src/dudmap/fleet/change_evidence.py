@@ -1,8 +1,8 @@
 """Compare the surface of one map with another of the same place.
 
-Every vertex is confirmed, denied, behind a surface, or not seen by the other map: denied in free space without surface
-within the noise of both maps, one voxel plus three standard deviations of the local noise: the larger of the sensor's
-and the spread of nearby distances.
+Every vertex is confirmed, denied, behind a surface, or not seen by the other map. It is denied if the other map has
+free space there and no surface within the noise of both maps. The noise is one voxel plus three standard deviations of
+the local noise, the larger of the sensor's and the spread of nearby distances.
 """
 
 from dataclasses import dataclass

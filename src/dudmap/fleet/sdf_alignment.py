@@ -26,7 +26,7 @@ COLOR_SHARE = 0.1
 SCALE = 0.5
 """Residual of Geman-McClure weight a quarter, voxels."""
 SHRINKING = 0.5
-"""Its factor per step, from the truncation distance."""
+"""Factor per step of the residual ``SCALE``, from the truncation distance."""
 MIN_POINTS = 500
 """Fewest points on the other surface."""
 MIN_STIFFNESS = 0.02

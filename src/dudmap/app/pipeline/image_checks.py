@@ -52,9 +52,9 @@ SHIFT = 3
 LOOKS = 12, 48
 """Frames that search another magnification, and that prove it."""
 PROVEN = 4.0
-"""Its smallest gain, standard errors."""
+"""Smallest gain of another magnification, standard errors."""
 MAGNIFIED_GAIN = 0.01
-"""Its smallest gain in correlation; registered images stay below -0.02."""
+"""Smallest gain in correlation of another magnification; registered images stay below -0.02."""
 FLAT = 0.01
 """Largest standard deviation from a plane of depth without relief, share of the depth."""
 STILL = 0.2

@@ -106,7 +106,7 @@ def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camer
 MOVES_PX = 1.0
 """Smallest error of a moving corner, pixels of an image 320 wide: 3.5 sigma."""
 MOVES_SIGMAS = 5.0
-"""The same in standard deviations of static corners."""
+"""Smallest error of a moving corner, standard deviations (per coordinate) of static corners."""
 MOVES_SHARE = 0.08
 """Share of a corner's flow added to either limit (motion blur, rolling shutter)."""
 FEWEST = 15

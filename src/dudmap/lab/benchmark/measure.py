@@ -36,7 +36,7 @@ COMPLETE_WITHIN = 0.02
 SAMPLES = 100_000
 """Points on each surface; shares vary by 0.03 %."""
 FEWER_SAMPLES = 40_000
-"""The same for many runs: 0.05 %."""
+"""Points on each surface for many runs: 0.05 %."""
 
 
 DIED: Row = {"error": "its process died without a result, as when it crashes or runs out of memory"}
