@@ -123,7 +123,7 @@ class _Read(NamedTuple):
 
 
 def _poses(path: Path, name: str | None, option: str) -> tuple[PoseFile, str]:
-    """Bonn's marker poses become camera poses."""
+    """Poses of a file without invalid rows, and their format; Bonn's marker poses become camera poses."""
     file = read_poses(path, "tum" if name == BONN else name, optional=True, option=option)
     if name != BONN:
         return file, file.format.name

@@ -115,7 +115,7 @@ def _unrelated(a: Numbers, b: Numbers, weights: Numbers) -> Numbers:
 
 
 def _turns(trajectory: Trajectory, times: Numbers) -> Numbers:
-    """NaN near the end."""
+    """Angles by which the camera turns in ``WINDOW`` seconds after given times, radians; NaN near the end."""
     Ts, stamps = trajectory.Ts_world_camera, trajectory.timestamps
     motions = se3.log_all(se3.inverse(Ts[:-1]) @ Ts[1:])
 

@@ -11,7 +11,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.map_samples import EMPTY, IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
 
 CELL = 0.25
-"""Cells of mean surface colours, metres."""
+"""Edge of the cells in which mean colours are compared, metres."""
 MIN_CELL_POINTS = 8
 """Fewest points of a cell."""
 MIN_COLORED = 200

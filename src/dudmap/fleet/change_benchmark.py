@@ -154,7 +154,7 @@ def _motion_error(true: TrueChange, T: NDArray[np.float64]) -> dict[str, float]:
 
 
 def measure_pair(pair: dict[str, Any], config: Config, min_size: float, keep: Path | None = None) -> dict[str, Any]:
-    """``keep``: folder that keeps the runs."""
+    """Render, run and compare one pair; return its row. ``keep``: folder that keeps the runs."""
     recordings, truth = rendered_pair(pair)
     row: dict[str, Any] = {"scene": pair["scene"], "seed": pair["seed"], "people": pair["people"]}
     with tempfile.TemporaryDirectory() as folder:

@@ -38,7 +38,7 @@ MAX_NOISE = 2.0
 EDGE_PIXELS = 2.0
 """Width of a depth edge, pixels and voxels."""
 READINGS = 2
-"""Observations of emptiness, of the carving weight, of a free place."""
+"""Observations of emptiness, each of the carving weight, that make a place free."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,11 +44,11 @@ ALL_PAIRS = PARTNERS
 """Runs up to which all pairs are compared."""
 Guesses = dict[tuple[int, int], NDArray[np.float64]]
 ROUNDS = 4
-"""Most rounds."""
+"""Most rounds of comparisons."""
 MIN_PREDICTED = 0.3
 """Smallest predicted overlap to compare, share of the smaller map."""
 CELL = 0.3
-"""Cells of overlap, metres."""
+"""Edge of the cells in which overlap is counted, metres."""
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.25, 5.0
 """A rejection is not valid for poses that differ by more (m, deg)."""
 

@@ -110,8 +110,11 @@ class Registration:
         return T, residuals(volume, levels[0], T, self.config.d_max)
 
     def _align_level(self, volume: TsdfVolume, level: Level, T: Array, labels: NDArray[np.bool_] | None) -> Array:
-        """Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end. As
-        in the text after it, both conditions must hold. A step that does not reduce the error is rejected."""
+        """Pose after the iterations of one level.
+
+        Reading: algorithm 2 iterates "while (pose difference) > 0.001 or iteration # < 5", which would not end. As in
+        the text after it, both conditions must hold. A step that does not reduce the error is rejected.
+        """
         found = residuals(volume, level, T, self.config.d_max)
         damping, error = self.config.lambda_0, self.error(found, labels)
         H, g = self.normal_equations(volume, level, T, found, labels)

@@ -71,7 +71,8 @@ def read_ahead(
     slam: "Slam | None" = None,
     start: int = 0,
 ) -> Generator[SourceFrame]:
-    """One thread reads, and with ``slam`` prepares, up to ``ahead`` frames ahead."""
+    """Yield frames ``start`` to ``count`` - 1 in order. One thread reads, and with ``slam`` prepares, up to ``ahead``
+    frames ahead."""
 
     def read(index: int) -> SourceFrame:
         begin = time.perf_counter()

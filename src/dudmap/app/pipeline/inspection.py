@@ -29,7 +29,7 @@ NEAR, FAR = 0.1, 8.0
 LEAST, LARGEST = 0.05, 25.0
 """Median depths, metres, outside of which any unit is doubted: wrist cameras 0.07 m, outdoor stereo 20 to 40 m."""
 LEFT_OUT = 0.1
-"""Share outside the depth range that warns."""
+"""Share of measurements outside the depth range that causes a warning."""
 NEAREST, FARTHEST = 0.2, 10.0
 """Plausible 5th and 95th percentile of depths, metres, if the median is outside ``SEEN``."""
 SEEN = (0.4, 4.0)
@@ -37,9 +37,9 @@ SEEN = (0.4, 4.0)
 FEW_READINGS = 0.2
 """Share of pixels with depth below which it is sparse."""
 GAP = 3.0
-"""Gap between frames, medians."""
+"""Time between frames that is a gap, medians."""
 LEFT_OVER = 0.02
-"""Share of unpaired images that warns."""
+"""Share of images without a partner that causes a warning."""
 SLOW, FAST = 1.0, 0.001
 """Median frame interval, seconds, outside of which time unit or camera is wrong."""
 LATE = 0.015

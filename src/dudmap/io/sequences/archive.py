@@ -51,7 +51,7 @@ def split(path: Path) -> tuple[Path, PurePosixPath] | None:
 
 
 def cache_folder() -> Path:
-    """DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap.
+    """Folder of unpacked archives: DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap.
 
     Raises:
         DatasetError: The user has no home folder.

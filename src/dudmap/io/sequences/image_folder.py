@@ -23,7 +23,7 @@ PROBES = 30
 OFF_CENTER = 0.08
 """Largest offset of a plausible principal point, share of the image."""
 FRAME_RATE = 30.0
-"""Assumed rate without times, 1/s: of most depth cameras."""
+"""Assumed frames per second of recordings without times: the rate of most depth cameras."""
 
 
 class ImageFolder(Recording):

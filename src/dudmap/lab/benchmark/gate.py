@@ -72,7 +72,7 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Row]:
 
 
 def load_figures(path: Path) -> dict[str, Any]:
-    """``margins`` by metric, and ``figures`` by recording and metric."""
+    """Content of the file: ``margins`` by metric, and ``figures`` by recording and metric."""
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:

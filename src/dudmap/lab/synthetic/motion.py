@@ -109,7 +109,7 @@ def crossing(
 
 
 def smooth_step(share: float) -> float:
-    """Cubic step from 0 to 1 with zero end slopes."""
+    """Cubic step: 0 below 0, 1 above 1, with zero slope at both ends."""
     x = min(max(share, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
 

@@ -134,7 +134,10 @@ def _six(values):
 
 @scalar
 def _add_products(rows, count, begin, place, H, b):
-    """Unknowns before ``begin`` are omitted; unknown k is number ``place + k`` of ``H`` and ``b``."""
+    """Add the products of all rows to the normal equations; the last row holds the residuals.
+
+    Unknowns before ``begin`` are omitted; unknown k is number ``place + k`` of ``H`` and ``b``.
+    """
     last, padded = len(rows) - 1, _padded(count)
     for k in range(begin, last + 1):
         for n in range(count, padded):

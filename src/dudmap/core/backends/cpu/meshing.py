@@ -34,7 +34,9 @@ def _corner_words(geometry, near, row, words):
 
 @kernel
 def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count, cases):
-    """A distance jump above ``max_jump`` steps is an occlusion boundary, no surface.
+    """Case of each cell of blocks ``start`` to ``stop``; 0 without a surface or with an untrusted corner.
+
+    A distance jump above ``max_jump`` steps is an occlusion boundary, no surface.
 
     Returns:
         (stop - start,) int64 triangles per block.

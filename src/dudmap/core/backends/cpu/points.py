@@ -6,7 +6,7 @@ from dudmap.core.backends.cpu.hashing import place_of
 from dudmap.core.backends.threads import kernel
 
 UNSEEN, OBSERVED, EMPTY = 0, 1, 2
-"""A voxel around a point was never observed; all were observed; all lie in free blocks."""
+"""State of a point: a voxel around it was never observed; all were observed; all lie in free blocks."""
 SDF, WEIGHT, INTENSITY, RED = 0, 4, 5, 9
 """First columns of ``sample_points``: distance (steps) and gradient (per voxel), weight, intensity and gradient, colour
 (quarters of a grey level)."""
