@@ -17,8 +17,6 @@ SECOND = 1.0
 
 
 class _Request:
-    """The first request of the process."""
-
     signal: int = 0
     time: float = 0.0
     postponed: int = 0

@@ -77,7 +77,6 @@ def _name(function: Any) -> str:  # noqa: ANN401
 
 
 def _text(value: Any, called: list[Any] | None = None) -> str:  # noqa: ANN401
-    """Text of a value that a kernel reads; functions are added to ``called``."""
     value = getattr(value, "inlined", value)
     if isinstance(value, PLAIN):
         return f"{type(value).__name__} {value!r}"

@@ -315,7 +315,6 @@ class Slam(SlamResults, Stateful):
         return view
 
     def _start_map(self, view: FrameView) -> FrameResult:
-        """Start a map with a frame, at its given pose or in its camera frame."""
         T_start = self.motion.start
         estimate = PoseEstimate.at_origin(view.first_gain if self.config.tracker.exposure else 1.0, T_start)
         mask = estimate.dynamic_mask(view)
@@ -418,7 +417,6 @@ class Slam(SlamResults, Stateful):
         self.predictor.update(view, estimate)
 
     def _fusion_verdict(self, view: FrameView, estimate: PoseEstimate) -> Verdict:
-        """Whether the pose of a tracked frame is certain, and its view not redundant."""
         repeats, unused = self.stream.repeats == "color", "map without texture" if self.young_map.textureless else ""
         certain = Verdict((
             Outcome.of("color_repeats", repeats, 0, "the colour image equals the one before", overruled_by=unused),

@@ -143,7 +143,6 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
 
 
 def _unpaired(pairs: int, estimate: Trajectory, reference: Trajectory, max_difference: float) -> str:
-    """Sentence on too few matching poses, with the option to try."""
     shortest = min(len(estimate), len(reference))
     if shortest < FEWEST_PAIRS:
         mend = f"give a trajectory of at least {FEWEST_PAIRS} poses"

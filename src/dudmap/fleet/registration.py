@@ -99,7 +99,6 @@ def most_similar(votes: NDArray[np.float32], partners: int) -> list[tuple[int, i
 
 
 def _whitened(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Whitened principal components, unit length."""
     count, size = descriptors.shape
     centred = (descriptors - descriptors.mean(axis=0)).astype(np.float64)
     wide = count < size  # decompose the smaller of both products; their nonzero eigenvalues are equal

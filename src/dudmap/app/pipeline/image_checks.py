@@ -129,7 +129,6 @@ def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _turn_warnings(frames: "list[Frame]") -> list[str]:
-    """Warn if edges coincide only after an image is turned."""
     pairs = [_edges(frame) for frame in frames if frame.depth.shape == frame.rgb.shape[:2]]
     if len(pairs) < FEWEST or len({edges.shape for edges, _ in pairs}) > 1:
         return []
@@ -197,7 +196,6 @@ def unregistered(magnification: float) -> str:
 
 
 def _magnified_agreement(frame: "Frame", camera: "Camera", given: Calibration) -> NDArray[np.float32]:
-    """Edge correlations (magnifications, shifts)."""
     edges, steps = _edges(frame)
     steps, out = _flattened(steps, np.ones_like(steps)), []
     size, border = steps.shape[::-1], (SHIFT, SHIFT, SHIFT, SHIFT, cv2.BORDER_CONSTANT)
@@ -242,7 +240,6 @@ def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[
 
 
 def _plane_warnings(frames: "list[Frame]", grays: list[NDArray[np.float32]]) -> list[str]:
-    """Warn of one resting plane of depth while colours change."""
     planes = _planes(frames)
     exposed = [gray / (gray.mean() + np.float32(1e-3)) for gray in grays]
     changes = [np.abs(b - a).mean() for a, b in pairwise(exposed) if a.shape == b.shape]

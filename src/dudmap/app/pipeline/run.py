@@ -342,7 +342,6 @@ class Job:
             yield state, store
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
-        """Write the run folder; delete the state unless stopped."""
         self.display.working("writing")
         slam, record = state.slam, state.record
         if stopped and state.number:  # the first pass is complete, the second is not

@@ -33,8 +33,6 @@ TRIANGLES = 1_000_000
 
 @dataclass
 class _Update:
-    """Data not shown yet: metrics of all frames, latest images."""
-
     figures: list[FrameFigures] = field(default_factory=list)
     images: FrameImages | None = None
     poses: "dict[float, NDArray] | None" = None

@@ -39,7 +39,6 @@ def plots(run: RunFiles) -> dict[str, str]:
 
 
 def _from_above(run: RunFiles) -> str:
-    """Trajectories on the ground, first view upwards; lost parts dashed."""
     across, frames = _ground_axes(run), run.figures()
     places = [np.full(3, np.nan) if frame.T_world_camera is None else frame.T_world_camera[:3, 3] for frame in frames]
     path = np.array(places) @ across.T

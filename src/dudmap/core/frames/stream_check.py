@@ -109,7 +109,6 @@ class StreamCheck(Stateful):
         return ACCEPTED
 
     def _stamp_outcomes(self, stamp: float) -> Iterator[Outcome]:
-        """Whether a stamp can follow the last used one."""
         if self._last_stamp is None:
             return
         step, usual = stamp - self._last_stamp, self._usual_interval

@@ -91,7 +91,6 @@ class OtherView:
     def _splatted(
         self, rows: NDArray[np.intp], columns: NDArray[np.intp], z: NDArray[np.float32], T: NDArray[np.float64]
     ) -> NDArray[np.float32]:
-        """Nearest depths of pixels, each as wide as itself."""
         points = self.depth_lens.points(rows, columns, z.astype(np.float64))
         uv, depths = self.color_lens.project(points @ T[:3, :3].T + T[:3, 3])
         order = np.argsort(-depths)  # the nearest is written last

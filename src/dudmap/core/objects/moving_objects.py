@@ -23,8 +23,6 @@ MOST_WAITING = 30
 
 @dataclass(eq=False)
 class _Frame:
-    """A tracked frame, and its objects once computed."""
-
     timestamp: float
     dynamic: NDArray[np.bool_]
     level: Level

@@ -206,7 +206,6 @@ class ObjectFusion(Stateful):
         return [self._with_velocity(mover, now) for mover in movers]
 
     def _with_velocity(self, mover: Mover, now: float) -> Mover:
-        """Object with the velocity of its map's centre."""
         track = self._tracks.get(mover.id)
         if track is None or len(track.Ts_camera_object) < YOUNG_FRAMES:
             return mover
@@ -251,7 +250,6 @@ class ObjectFusion(Stateful):
         observation: Observation,
         T_world_camera: NDArray[np.float64],
     ) -> None:
-        """Register a frame to the object's map; fuse it if consistent."""
         now, duration = observation.timestamp, observation.timestamp - track.last_seen
         still = np.zeros(3)
         velocities = (
@@ -295,7 +293,6 @@ class ObjectFusion(Stateful):
         return self.tracker.align(volume, view.levels, T, weights, first_level=3 - len(view.levels))
 
     def _fuse(self, track: ObjectTrack, view: ObjectView, T_object_camera: NDArray[np.float64], now: float) -> None:
-        """Integrate a frame into the object's map; update the surface sample and the displacement."""
         level, mask = view.levels[-1], view.mask
         track.volume.camera = level.camera
         track.volume.integrate(Frame(now, level.depth, view.color), T_object_camera, mask)

@@ -114,7 +114,6 @@ class _Shape:
 
     @classmethod
     def of(cls, pixels: NDArray[np.intp], area: float, level: Level, T_world_camera: NDArray[np.float32]) -> "_Shape":
-        """Object with the given pixels and surface."""
         v, u = np.divmod(pixels, level.camera.width)
         points = level.camera.points(u, v, level.depth.reshape(-1)[pixels])
         points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
@@ -212,10 +211,7 @@ class ObjectTracker(Stateful):
     def _joined(
         self, numbers: NDArray[np.int32], predicted: NDArray[np.uint8], level: Level
     ) -> list[tuple[NDArray[np.intp], float]]:
-        """Pixels and surface of each object: a region with near fragments of the same prediction, or much smaller ones.
-
-        A fragment is near the object, and either has the same prediction or is much smaller.
-        """
+        """Pixels and surface of each object: a region with near fragments, of the same prediction or much smaller."""
         regions = measured_regions(numbers, level)
         if regions is None:
             return []
@@ -270,7 +266,6 @@ class ObjectTracker(Stateful):
         return [found[i] for i in range(len(objects))]
 
     def _update_velocity(self, track: _Track, measurement: _Measurement) -> None:
-        """Velocity: median of the estimates."""
         recent = [m for m in track.measurements if measurement.time - m.time < VELOCITY_WINDOW]
         track.measurements = [*recent, measurement]
         estimates = []

@@ -156,8 +156,8 @@ class Relocalizer(Stateful):
     def _shows_static_world(self, before: tuple[Pyramid, Segmentation] | None, view: FrameView) -> bool:
         """Whether the motion since an earlier lost image is certainly the camera's.
 
-        A near crowd may fill most pixels, the far world most surface. A map starts only if one motion explains AGREED
-        of the surface and most of the pixels. Exceptions:
+        A near crowd may fill most pixels. One motion must explain AGREED of the surface and most of the pixels.
+        Exceptions:
 
         * No common motion (no texture): True unless most of the view moved when the camera was lost.
         * Images are not compared (``dynamics.start_seconds`` = 0): True.

@@ -282,7 +282,6 @@ def _option(name: str) -> str:
 
 
 def _find(path: Path) -> tuple[Path, type[Recording]]:
-    """Recording at a path, in it, or in the archive at it."""
     from dudmap.io.sequences.archive import split, unpack
 
     reader = reader_of(path) if path.exists() else None

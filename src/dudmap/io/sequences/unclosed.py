@@ -43,8 +43,6 @@ class CompletedFile:
 
 
 class _Completed(io.RawIOBase):
-    """An open ``CompletedFile``."""
-
     def __init__(self, whole: CompletedFile) -> None:
         self._whole, self._file, self._position = whole, open_plain(whole.path), 0
 

@@ -15,8 +15,6 @@ from dudmap.lab.benchmark.measure import grid
 
 
 class _Times(event.Listener):
-    """Time of each kernel."""
-
     def __init__(self) -> None:
         self.rows: dict[str, dict[str, Any]] = {}
         self.part, self._open = "", list[float]()
