@@ -1,8 +1,8 @@
 """Relative poses of runs: similar runs first, then runs that overlap.
 
 Places are recognised by VLAD (Jegou et al. 2010): differences of features to their nearest visual words (k-means),
-summed and normalised per word (Arandjelovic and Zisserman 2013). Whitening (Jegou and Chum 2012), because many places
-share doors and wallpaper.
+summed and normalised per word (Arandjelovic and Zisserman 2013). Sums are whitened (Jegou and Chum 2012), because many
+places share doors and wallpaper.
 """
 
 import logging

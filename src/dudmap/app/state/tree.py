@@ -1,10 +1,8 @@
-"""State as a tree of plain values and arrays, and back, by annotations, which determine classes.
+"""State as a tree of plain values and arrays, and back; annotations of attributes determine the classes.
 
-A value that does not fit raises an error.
-
-- A ``Stateful`` object is restored in place.
-
-A node is a number, text, None, or an object with an ``id``.
+A value that does not fit raises an error. ``Stateful`` objects are restored in place, dataclasses and named tuples are
+created from their fields; functions without arguments and futures are stored by their result. A node is a number,
+text, None, or an object with an ``id``.
 """
 
 from collections import deque

@@ -44,7 +44,6 @@ def displacements(
     """Median displacement (3,) of each object's pixels, matched by forward-backward optical flow: metres, world frame.
 
     ``objects``: pixels (n,) in ``now``, as flat indices. Displacements longer than ``max_jump`` metres are mismatches.
-    Displacements longer than ``max_jump`` metres are mismatches.
     """
     import cv2
 

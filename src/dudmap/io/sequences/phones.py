@@ -1,7 +1,7 @@
 """Phone recordings: Stray Scanner, ARKitScenes, Polycam, Record3D, nerfstudio's form.
 
-ARKit's depth has 256x192 pixels in the view of colour; pixels of confidence 0 are omitted. Pixels of confidence 0, the
-lowest, are omitted, as Polycam's documentation advises.
+ARKit's depth has 256x192 pixels in the view of colour. Pixels of confidence 0, the lowest, are omitted, as Polycam's
+documentation advises.
 """
 
 import math

@@ -1,7 +1,8 @@
 """Depth of 16-bit millimetres rotated left by three bits, as in SUN3D (Xiao et al. 2013), SUN RGB-D and the Amazon
 Picking Challenge.
 
-``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, small numbers beyond; units of 1/8 mm read the same.
+``(mm << 3) | (mm >> 13)``: eighths of a millimetre up to 8.19 m, small numbers beyond. Values in units of 1/8 mm are
+read the same.
 """
 
 from collections.abc import Callable

@@ -24,7 +24,7 @@ def fit_exposure(
     """Gain and offset with ``gain * intensity + offset`` closest to the map's, robust, without saturated pixels.
 
     If median or contrast change by more than LARGE_GAIN, a second candidate comes from the quartiles, corrected by a
-    second fit below LARGE_GAIN; the smaller median error wins. The smaller median error wins.
+    second fit below LARGE_GAIN; the smaller median error wins.
 
     Args:
         intensity: (h, w) float32 of the image.
