@@ -185,8 +185,9 @@ def test_a_map_is_painted_anew_over_many_frames_as_it_is_at_once():
         atlas.recolor()
         if not gradually:
             atlas.complete()
-        while atlas.repainting is not None:
+        while not atlas.take_repainted():
             assert content(atlas.volume) == before
+            assert frames < COUNT
             atlas.continue_rebuilding()
             frames += 1
         assert frames == (-(-COUNT // PER_FRAME) if gradually else 0)

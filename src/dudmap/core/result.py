@@ -126,8 +126,10 @@ class FrameResult:
 
     @property
     def uncertain(self) -> str:
-        """Why pose and labels of a tracked frame may be wrong; empty if certain."""
-        return next((one.reason for one in self.verdict.failed if one.name in UNCERTAIN), "")
+        """Why pose and labels of a tracked frame may be wrong; empty if certain. In a crowd the frame is fused."""
+        failed, outcomes = self.verdict.failed, self.verdict.outcomes
+        doubts = (one for one in outcomes if one.name == "crowd" or (one.name in UNCERTAIN and one in failed))
+        return next((one.reason for one in doubts if one.reason), "")
 
     @property
     def histogram(self) -> NDArray[np.int64] | None:

@@ -418,10 +418,12 @@ class Slam(SlamResults, Stateful):
 
     def _fusion_verdict(self, view: FrameView, estimate: PoseEstimate) -> Verdict:
         repeats, unused = self.stream.repeats == "color", "map without texture" if self.young_map.textureless else ""
+        crowd = self.predictor.mostly_dynamic and self.predictor.image_motion.map_is_young(view.timestamp)
         certain = Verdict((
             Outcome.of("color_repeats", repeats, 0, "the colour image equals the one before", overruled_by=unused),
             Outcome.of("blind", view.blind and not repeats, 0, "the image has no contrast, or the light has changed"),
             *estimate.doubts(view),
+            Outcome.of("crowd", crowd, 0, "most of the view moves, and the map is young", overruled_by="static part"),
             Outcome.of("localize", self.localize, 0, "the map is not changed"),
             *((Outcome.of("shed", 1, 0, "no time to fuse the frame"),) if Shed.FUSION in view.shed else ()),
         ))  # fmt: skip

@@ -217,24 +217,25 @@ class YoungMap(Stateful):
             self._shown = is_majority_dynamic(last.moving, last.view.labelled)
         self._frames = [] if self._decisions == len(UNDECIDED) else frames[::2]
         rest, anchor, T_anchor, contradicted = frames, now, now.T_world_camera, False
-        hops: list[tuple[TrackedImage, list[StartFrame]]] = []
+        hops: list[tuple[TrackedImage, list[StartFrame], bool]] = []
         while rest and (reference := self._reference(anchor, rest)) is not None:
             first, motion = reference
-            contradicted |= self._contradicts(motion, anchor, rest[first])
+            refuted = self._contradicts(motion, anchor, rest[first])
+            contradicted |= refuted
             moving = _union(anchor.moving, propagate_to_segments(motion.before))
             self._mostly |= is_majority_dynamic(moving, anchor.pyramid.labelled)
-            hops.insert(0, (replace(anchor, T_world_camera=T_anchor, moving=moving), rest[first:]))
-            if (found := self._compared(hops[0][0], rest[first])) is None:
+            hops.insert(0, (replace(anchor, T_world_camera=T_anchor, moving=moving), rest[first:], refuted))
+            if (found := self._compared(hops[0][0], rest[first], conservative=not refuted)) is None:
                 break
             anchor = rest[first].view.tracked_at(rest[first].T_world_camera, moving=found.moving)
             rest, T_anchor = rest[:first], found.T_world_camera
         if not contradicted:
             return []
         pairs = [
-            (frame, self._compared(anchor, frame))
-            for anchor, hop in hops
-            for frame in hop
-            if not (self._slow and self._adjacent(anchor, frame))  # slow motion is hidden between adjacent images
+            (frame, self._compared(anchor, frame, conservative=not refuted))
+            for anchor, hop, refuted in hops
+            for frame in hop  # slow motion is hidden between adjacent images; tracking goes on from the newest frame
+            if frame is frames[-1] or not (self._slow and self._adjacent(anchor, frame))
         ]
         return self._revised([(before, after) for before, after in pairs if after is not None])
 
@@ -246,7 +247,7 @@ class YoungMap(Stateful):
         """
         sure = None
         for number, frame in enumerate(frames):
-            motion = self._motion(now, frame, doubtful=True)
+            motion = self._motion(now, frame, conservative=True)
             if motion is None or motion.share < 0.5 or np.count_nonzero(motion.before.static) < 2 * FEWEST:
                 continue
             if motion.share >= AGREED or self._contradicts(motion, now, frame):
@@ -254,18 +255,21 @@ class YoungMap(Stateful):
             sure = sure or (number, motion)
         return sure
 
-    def _motion(self, now: TrackedImage, frame: StartFrame, *, doubtful: bool) -> DominantMotion | None:
+    def _motion(self, now: TrackedImage, frame: StartFrame, *, conservative: bool) -> DominantMotion | None:
         if frame.view.without_image:
             return None
         older = frame.view.tracked_at(frame.T_world_camera)
-        return now.motion_to(older, consecutive=self._adjacent(now, frame), doubtful=doubtful)
+        return now.motion_to(older, consecutive=self._adjacent(now, frame), conservative=conservative)
 
     def _adjacent(self, now: TrackedImage, frame: StartFrame) -> bool:
         return now.timestamp - frame.view.timestamp < 1.5 * self._interval
 
-    def _compared(self, now: TrackedImage, frame: StartFrame) -> StartFrame | None:
-        """An older frame as its comparison with an image shows it; None if unknown."""
-        motion = self._motion(now, frame, doubtful=False)
+    def _compared(self, now: TrackedImage, frame: StartFrame, *, conservative: bool) -> StartFrame | None:
+        """An older frame as its comparison with an image shows it; None if unknown.
+
+        ``conservative``: Only a clearly better pose replaces the expected one, which the reference confirmed.
+        """
+        motion = self._motion(now, frame, conservative=conservative)
         if motion is None:
             return None
         T = now.T_world_camera @ se3.inverse(motion.T_after_before)

@@ -287,7 +287,7 @@ def _losses(metrics: dict[str, Any]) -> Html:
         (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),
         (metrics.get("blind"), "images told too little: tracked by distances alone, they are not in the map"),
         (metrics.get("colorless"), "frames without colour were tracked by distances alone"),
-        (metrics.get("uncertain"), "frames with uncertain poses or labels are not in the map"),
+        (metrics.get("uncertain"), "frames have uncertain poses or labels"),
         (metrics.get("degenerate"), "of them do not show all directions of motion"),
         (metrics.get("dropped"), "frames arrived too fast and were dropped"),
         ((metrics.get("maps") or 1) - 1, "submaps could not be joined with the main one"),

@@ -118,11 +118,9 @@ FEWEST_MOVING = 3
 """Fewest moving (static) corners of a moving (static) segment: three determine a rigid motion."""
 AGREED = 0.7
 """Smallest share of moving corners in a moving segment, and of surface that clearly follows one motion."""
-TIGHTER = 0.5
-"""Largest error of a motion's static corners, as a share of the expected motion's, to replace it: a pose that followed
-people fits loosely."""
-SUPPORTED = 0.8
-"""Alternative to TIGHTER: smallest number of resting corners, as a share of the expected motion's."""
+CLEARLY = 3.0
+"""Smallest difference of two medians of errors, in standard errors. The ratio of the medians of two sets of n corners
+each has the standard error 1.02 / sqrt(n)."""
 NOISE_SHARE = 0.02
 """Largest share of moving measurements that is noise."""
 
@@ -202,7 +200,7 @@ def dominant_motion(
     T_expected: NDArray[np.float64] | None = None,
     *,
     consecutive: bool = True,
-    doubtful: bool = False,
+    conservative: bool = False,
 ) -> DominantMotion | None:
     """Motion of the static world between two images, and the corners that do not follow it.
 
@@ -227,7 +225,8 @@ def dominant_motion(
         moving: (h, w) bool, known moving pixels of the first image, excluded from the estimate.
         T_expected: (4, 4) predicted motion, start of the corner search. None: the identity.
         consecutive: Whether the expected motion is a prior; over longer times a pose may have followed a crowd.
-        doubtful: The expected motion is the result unless another fits its static corners clearly more tightly.
+        conservative: If not consecutive, the expected motion is the result unless another fits its static corners
+            clearly more tightly (``_tightest``).
 
     Returns:
         None if too few corners follow one motion.
@@ -249,17 +248,10 @@ def dominant_motion(
     near_px = NEAR_PX if consecutive else np.inf
     T = rigid_motion(points[candidate], targets[candidate], camera, T_expected, near_px)
     predicted, flow, areas = reproject(T, points, camera), lengths(targets - pixels), points[:, 2] ** 2
-    if doubtful and not consecutive:
-        limit = pixels_at_width(MOVES_PX, camera) + MOVES_SHARE * flow
-        nearest = _refined(T_expected, points[candidate], targets[candidate], limit[candidate], camera)
-        by_found, by_nearest, by_expected = (
-            lengths(there - targets)[candidate]
-            for there in (predicted, reproject(nearest, points, camera), expected[found])
-        )
-        supported = np.count_nonzero(by_found <= limit[candidate]), np.count_nonzero(by_expected <= limit[candidate])
-        tight = _misfit(by_found, limit[candidate]) <= TIGHTER * _misfit(by_nearest, limit[candidate])
-        if not tight and supported[0] < SUPPORTED * supported[1]:
-            T, predicted = T_expected, expected[found]
+    if conservative and not consecutive:
+        limit = pixels_at_width(MOVES_PX, camera) + MOVES_SHARE * flow[candidate]
+        T = _tightest(T, T_expected, points[candidate], targets[candidate], limit, camera)
+        predicted = reproject(T, points, camera)
     error = lengths(predicted - targets)
     threshold = pixels_at_width(NOISE_PX, camera)
     inlier = error < threshold
@@ -305,10 +297,34 @@ def dominant_motion(
     )
 
 
-def _misfit(error: NDArray[np.float64], limit: NDArray[np.float64]) -> float:
-    """Median of the errors within their limits, px."""
+def _tightest(
+    T: NDArray[np.float64],
+    T_expected: NDArray[np.float64],
+    points: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    limit: NDArray[np.float64],
+    camera: Camera,
+) -> NDArray[np.float64]:
+    """Motion (4, 4) that its static corners fit best: the expected one, the same refined, or T; the earlier one if no
+    later one is clearly better.
+
+    The static world is rigid, and a pose that followed people fits them loosely. The corners (n,) within the limits
+    (n,) px of a motion are compared by their median error.
+    """
+
+    def clearly_tighter(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+        (num, misfit), (_, other) = (_misfit(lengths(reproject(M, points, camera) - targets), limit) for M in (a, b))
+        return num > CLEARLY**2 and misfit <= (1 - CLEARLY / np.sqrt(num)) * other
+
+    T_refined = _refined(T_expected, points, targets, limit, camera)
+    T_found = T if clearly_tighter(T, T_refined) else T_refined
+    return T_found if clearly_tighter(T_found, T_expected) else T_expected
+
+
+def _misfit(error: NDArray[np.float64], limit: NDArray[np.float64]) -> tuple[int, float]:
+    """Number and median of the errors (n,), px, within their limits (n,)."""
     rests = error <= limit
-    return float(np.median(error[rests])) if rests.any() else np.inf
+    return np.count_nonzero(rests), float(np.median(error[rests])) if rests.any() else np.inf
 
 
 def _refined(

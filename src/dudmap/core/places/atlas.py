@@ -142,7 +142,7 @@ class Atlas(Stateful):
 
     def take_repainted(self) -> bool:
         """Take the colours of a complete repainting; returns whether no repainting is left."""
-        if self.repainting is not None and self.repainting.fuse(PER_FRAME):
+        if self.repainting is not None and not self.repainting.missing:
             self._complete_repainting()
         return self.repainting is None
 

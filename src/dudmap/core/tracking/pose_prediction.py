@@ -62,7 +62,6 @@ class PosePredictor(Stateful):
 
     image_motion: Remembered[ImageMotion]
     mostly_dynamic: Remembered[bool] = False  # most of the view moved in the last tracked frame
-    _last_dynamic: Remembered[NDArray[np.bool_] | None] = None  # dynamic pixels of the last tracked frame
     _single_frame_map: Remembered[bool] = False  # the map consists of one frame, whose dynamic pixels are unknown
 
     def __init__(
@@ -110,7 +109,6 @@ class PosePredictor(Stateful):
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Set the image for the next comparison."""
         dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
-        self._last_dynamic = dynamic
         self.mostly_dynamic = dynamic is not None and is_majority_dynamic(dynamic, view.labelled)
         if self.image_motion.seconds > 0:
             with view.timer("parallax"):
@@ -122,7 +120,8 @@ class PosePredictor(Stateful):
         self, volume: TsdfVolume, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level
     ) -> bool:
         """Whether T explains the image clearly better, without measurements in free space."""
-        weights = initial_weights([level], self._last_dynamic, []) or [np.ones_like(level.depth)]
+        last = self.image_motion.last
+        weights = initial_weights([level], None if last is None else last.moving, []) or [np.ones_like(level.depth)]
         static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
         cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
         return cost < CLEARLY_BETTER * other
