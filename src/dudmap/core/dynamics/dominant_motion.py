@@ -324,7 +324,7 @@ def _tightest(
 def _misfit(error: NDArray[np.float64], limit: NDArray[np.float64]) -> tuple[int, float]:
     """Number and median of the errors (n,), px, within their limits (n,)."""
     rests = error <= limit
-    return np.count_nonzero(rests), float(np.median(error[rests])) if rests.any() else np.inf
+    return int(np.count_nonzero(rests)), float(np.median(error[rests])) if rests.any() else np.inf
 
 
 def _refined(
