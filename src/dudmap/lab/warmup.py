@@ -36,6 +36,7 @@ from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.objects.regions import connected_regions
 from dudmap.core.slam import Slam
 from dudmap.thesis.slam import ThesisSlam
 from dudmap.thesis_config import ThesisConfig
@@ -47,7 +48,9 @@ CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 SECOND_PROCESS = "labels", "several voxel sizes"
 """Parts of a second process, about half of the time."""
 DURING_RUN = "motion between images", "labels", "calibration", "mesh"
-"""Parts that it compiles while a run begins, by use."""
+"""Parts that the second process compiles while a run begins, in the order of their use."""
+DURING_DEMO = "motion between images", "labels", "synthetic frames", "mesh", "view"
+"""The same for a demo, which is not calibrated. The first three take less time than the first process."""
 
 
 def room(count: int) -> list[Frame]:
@@ -98,6 +101,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
             moving, segments, sigma = view.labelled.depth > 0, view.segmentation(), view.labelled.depth
             detector.memory.update(number, view.labelled, start, moving, segments)
             detector.memory.settled(number, view.labelled, start, segments, sigma, moving)
+            connected_regions(moving, view.labelled)
             full_size(moving, view.labelled.depth, view.observation.depth)
         fit_mixture(np.ones(BINS, np.int64), EDGES)  # as at the end of a run
 
@@ -196,7 +200,7 @@ def compiled_for_demo() -> Iterator[None]:
         yield
         return
     log.info(COMPILING)
-    with compiled_in_background(("tracking, labels and map", "synthetic frames"), DURING_RUN) as wait:
+    with compiled_in_background(("tracking, labels and map",), DURING_DEMO) as wait:
         wait()
         yield
 

@@ -121,7 +121,7 @@ class VoxelBlocks(Stateful):
         self.geometry, self.colors = (np.zeros((room, BLOCK**3), np.int32) for _ in range(2))
         self.use_slots(m)
         self.table = np.full(self.table_size, hashing.EMPTY, dtype=np.int32)
-        hashing.rebuild(self.table, self.coords, n)
+        self._fill_table()
 
     @property
     def geometry(self) -> NDArray[np.int32]:
@@ -197,6 +197,10 @@ class VoxelBlocks(Stateful):
         entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
         return entries
 
+    def _fill_table(self) -> None:
+        """Fill the empty table with all entries."""
+        hashing.insert_all(self.table, self.coords, 0, self.coords[: self.num_entries])
+
     def reserve_entries(self, needed: int) -> None:
         """Grow the arrays to at least ``needed`` entries."""
         if needed > len(self.coords):
@@ -207,7 +211,7 @@ class VoxelBlocks(Stateful):
         if needed > MAX_LOAD * len(self.table):
             size = max(int(needed / MAX_LOAD), len(self.table)) * 3 // 2  # a search in a full table would not end
             self.table = np.full(size, hashing.EMPTY, dtype=np.int32)
-            hashing.rebuild(self.table, self.coords, self.num_entries)
+            self._fill_table()
 
     def reserve_slots(self, needed: int) -> None:
         """Grow the arrays to at least ``needed`` slots."""
@@ -289,7 +293,7 @@ class VoxelBlocks(Stateful):
             array[m:n] = unused
         self.num_entries = m
         self.table.fill(hashing.EMPTY)
-        hashing.rebuild(self.table, self.coords, m)
+        self._fill_table()
 
     def insert(self, records: BlockRecords, frame_number: int) -> NDArray[np.int32]:
         """Add unknown blocks; returns the slots (m,) int32 with voxels."""

@@ -54,14 +54,6 @@ def insert_all(table, coords, num_entries, wanted):
 
 
 @kernel
-def rebuild(table, coords, num_entries):
-    """Fill an empty ``table`` with entries 0 to ``num_entries``."""
-    for entry in range(num_entries):
-        x, y, z = np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2])
-        table[place_of(table, coords, x, y, z)] = entry
-
-
-@kernel
 def in_use(slots, entry_of):
     """The slots (n,) that belong to an entry."""
     kept, count = np.empty_like(slots), 0
