@@ -49,8 +49,8 @@ SECOND_PROCESS = "labels", "several voxel sizes"
 """Parts of a second process, about half of the time."""
 DURING_RUN = "motion between images", "labels", "calibration", "mesh"
 """Parts that the second process compiles while a run begins, in the order of their use."""
-DURING_DEMO = "motion between images", "labels", "synthetic frames", "mesh", "view"
-"""The same for a demo, which is not calibrated. The first three take less time than the first process."""
+BEFORE_DEMO = ("tracking, labels and map", "mesh", "view"), ("motion between images", "labels", "synthetic frames")
+"""Parts of two processes before a demo, which is not calibrated; both take the same time."""
 
 
 def room(count: int) -> list[Frame]:
@@ -179,7 +179,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
     """Compile in other processes during the block, given a second core and a cache folder.
 
-    The yielded function waits for the first.
+    The yielded function waits for the processes.
     """
     environment = os.environ | {"DUDMAP_THREADS": "1"} | kernel_cache.environment()
     useful = num_threads() > 1 and kernel_cache.folder() is not None
@@ -189,7 +189,7 @@ def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[],
         for process in started:
             ends.callback(process.wait)
             ends.callback(process.terminate)
-        yield started[0].wait if started else lambda: None
+        yield lambda: [process.wait() for process in started]
 
 
 @contextmanager
@@ -200,7 +200,7 @@ def compiled_for_demo() -> Iterator[None]:
         yield
         return
     log.info(COMPILING)
-    with compiled_in_background(("tracking, labels and map",), DURING_DEMO) as wait:
+    with compiled_in_background(*BEFORE_DEMO) as wait:
         wait()
         yield
 
