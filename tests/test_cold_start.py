@@ -46,7 +46,7 @@ def test_an_empty_and_a_filled_kernel_cache_give_equal_results(tmp_path):
 
 
 def test_a_kernel_is_compiled_again_when_its_digest_has_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
     for stamp, loaded in (("first", 0), ("first", 1), ("second", 0), ("second", 1)):
         monkeypatch.setattr(kernel_cache, "digest", lambda kernel, stamp=stamp: stamp)
         twice = threads.kernel(filtering.intensities.py_func)
@@ -78,13 +78,10 @@ def test_kernels_of_the_first_frames_do_not_compile_what_takes_seconds():
     slow, found, kernels = {"partition", "sort", "argsort", "unique", "median", "percentile"}, set(), 0
     for path in sorted((Path(dudmap.__file__).parent / "core" / "backends" / "cpu").glob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            decorators = getattr(node, "decorator_list", [])
-            if {one.id for one in decorators if isinstance(one, ast.Name)} & {
-                "kernel",
-                "scalar",
-                "exact",
-                "exact_scalar",
-            }:
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            marks = {one.id for one in node.decorator_list if isinstance(one, ast.Name)}
+            if marks & {"kernel", "scalar", "exact", "exact_scalar"}:
                 kernels += 1
                 called = {
                     one.func.attr
@@ -115,7 +112,7 @@ def test_garbage_is_collected_again_once_a_kernel_is_compiled():
 
 
 def test_a_formula_becomes_a_kernel_only_where_python_calls_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
 
     @threads.scalar
     def twice(value):
@@ -133,7 +130,7 @@ def test_a_formula_becomes_a_kernel_only_where_python_calls_it(tmp_path, monkeyp
 
 
 def test_two_processes_do_not_write_one_file_of_the_kernel_cache(tmp_path, monkeypatch):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
     threads.kernel(filtering.intensities.py_func)(0, 1, np.ones((1, 1, 3), np.uint8), np.zeros((1, 1), np.float32))
     (data,) = tmp_path.rglob("*.nbc")
     assert f".{os.getpid()}." in data.name
@@ -175,11 +172,13 @@ def test_the_first_demo_waits_for_two_processes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(warmup.subprocess, "Popen", Process)
     monkeypatch.setattr(warmup, "num_threads", lambda: 2)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "cache"))
     with warmup.compiled_for_demo():
         assert calls == [("wait", True), ("wait", False)]
     assert calls[2:] == [("terminate", False), ("wait", False), ("terminate", True), ("wait", True)]
     calls.clear()
-    (kernel_cache.folder() / "kernel.nbi").touch()
+    folder = kernel_cache.folder()
+    assert folder is not None
+    (folder / "kernel.nbi").touch()
     with warmup.compiled_for_demo():
         assert calls == []

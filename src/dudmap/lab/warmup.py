@@ -179,7 +179,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 def compiled_in_background(*processes: tuple[str, ...]) -> Iterator[Callable[[], object]]:
     """Compile in other processes during the block, given a second core and a cache folder.
 
-    The yielded function waits for the processes.
+    The yielded function waits for them.
     """
     environment = os.environ | {"DUDMAP_THREADS": "1"} | kernel_cache.environment()
     useful = num_threads() > 1 and kernel_cache.folder() is not None
