@@ -182,6 +182,7 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
     cases = [
         ((tmp_path / "empty", "--reference", recording), "holds no trajectory.txt"),
         ((tmp_path / "none.txt", "--reference", recording), "cannot read"),
+        ((run, "--reference", recording, "--format", "latex"), "the table takes --table-format latex"),
         ((tmp_path / "nan.txt", "--reference", recording), "line 1: expected eight finite numbers"),
         ((run, "--reference", tmp_path / "empty"), "there is no true trajectory"),
         ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),

@@ -94,6 +94,8 @@ def trajectory(
     from dudmap.evaluation.tables import FORMATS, table
 
     ending = _plot_ending(plots, plot_format)
+    if estimate_format in FORMATS:
+        raise ConfigError(f"--format is the format of the estimate; the table takes --table-format {estimate_format}")
     if table_format is not None and (table_format not in FORMATS or as_json):
         found = f"--table-format {table_format}{' and --json' if as_json else ''}"
         raise ConfigError(f"found {found}; expected one of {', '.join(FORMATS)}, or --json")
