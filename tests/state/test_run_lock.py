@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import pytest
 
+from dudmap.app.pipeline.environment import versions
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
 from dudmap.app.pipeline.run_folder import LOCK, run_lock
@@ -35,6 +36,7 @@ with run_lock(Path(sys.argv[1])):
 def test_the_holder_is_named_and_a_killed_one_holds_nothing(tmp_path):
     other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     try:
+        assert other.stdout is not None
         assert other.stdout.readline() == "held\n"
         with pytest.raises(DudmapError, match=f"in use by process {other.pid} on {socket.gethostname()} since 20"):
             with run_lock(tmp_path):
@@ -108,7 +110,10 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
              "code": "of yesterday", "versions": {"dudmap": "0.0"}, "pass": 0, "next": 0, "frame": ""}  # fmt: skip
     database = StateDatabase(out / "state.db")
     database.write_meta(about)
-    with pytest.raises(StateError, match="was written by another version of dudmap"):
+    with pytest.raises(StateError, match=r"was written by another version of dudmap .*\(dudmap 0\.0, here "):
+        resume(out)
+    database.write_meta({"versions": versions()})
+    with pytest.raises(StateError, match="its code has changed"):
         resume(out)
     database.write_meta({"code": code_fingerprint(), "recording": "of another room"})
     with pytest.raises(StateError, match="the recording desk has changed since the run"):

@@ -141,7 +141,11 @@ def on_device(config: Config, device: str | None) -> Config:
 def check_code(meta: dict[str, Any], path: Path) -> None:
     """Refuse a state of another version."""
     if meta.get("code") != code_fingerprint():
+        stored, here = meta.get("versions", {}), versions()
+        other = ", ".join(
+            f"{name} {stored.get(name)}, here {here[name]}" for name in here if stored.get(name) != here[name]
+        )
         raise StateError(
-            f"{path} was written by another version of dudmap or its libraries ({meta.get('versions', 'unknown')}); "
-            f"expected {versions()}, or begin again with dudmap run"
+            f"{path} was written by another version of dudmap or its libraries ({other or 'its code has changed'}); "
+            "bring it back, or begin again with dudmap run"
         )
