@@ -7,6 +7,7 @@ import numpy as np
 
 from dudmap.core.calibration import self_calibration
 from dudmap.core.calibration.estimator import SHUTTER, TESTED, CalibrationEstimator, Estimate
+from dudmap.core.verdict import Outcome, Verdict
 from dudmap.lab.synthetic.faults import SensorFaults
 
 DELAY = 0.03
@@ -19,7 +20,7 @@ class KnownDelay(CalibrationEstimator):
 
     def estimate(self, keyframes):
         found = replace(self.given, delay=DELAY, sigma=np.ones(13), estimated=("delay",))
-        return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), 4.0), 0.3, 80)
+        return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), Verdict((Outcome("evidence", 4.0),))), 0.3, 80)
 
 
 def find_early(monkeypatch, attempts):

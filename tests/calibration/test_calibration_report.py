@@ -6,11 +6,12 @@ import numpy as np
 
 from dudmap import Config
 from dudmap.app.pipeline.calibration import calibrate_start
-from dudmap.core.calibration.estimator import GROUPS, SHUTTER, TESTED, Estimate
+from dudmap.core.calibration.estimator import EVIDENCE, GROUPS, NOT_PROVEN, SHUTTER, TESTED, TOO_SMALL, Estimate
 from dudmap.core.calibration.findings import findings, outcome
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.verdict import Outcome, Verdict
 
 CAMERA = Camera(160, 160, 79.5, 59.5, 160, 120)
 
@@ -18,7 +19,10 @@ CAMERA = Camera(160, 160, 79.5, 59.5, 160, 120)
 def estimate(sigma: float, evidence: float, estimated: tuple[str, ...] = ()) -> Estimate:
     found = Calibration.registered(CAMERA)
     found = replace(found, sigma=np.full(NUM_PARAMETERS, sigma), estimated=estimated, vignetting_sigma=sigma)
-    return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), evidence), 0.0, 80)
+    share = Outcome.of("share", 0.001, 0.01, TOO_SMALL, at_least=True)
+    few = Outcome("evidence", reason="fewer than 14 pairs")
+    tested = few if np.isnan(evidence) else Outcome.of("evidence", evidence, EVIDENCE, NOT_PROVEN, at_least=True)
+    return Estimate(found, dict.fromkeys((*TESTED, SHUTTER), Verdict((tested, share))), 0.0, 80)
 
 
 def test_what_was_not_tested_is_called_assumed():

@@ -24,7 +24,7 @@ def problem():
 
 def same(one, other) -> bool:
     values = [np.array([*vars(each.calibration)["sigma"], each.gain, each.pairs]) for each in (one, other)]
-    return np.array_equal(*values, equal_nan=True) and one.evidence == other.evidence
+    return np.array_equal(*values, equal_nan=True) and one.verdicts == other.verdicts
 
 
 def test_the_result_is_that_of_this_process(problem):

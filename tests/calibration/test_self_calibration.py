@@ -17,6 +17,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
+from dudmap.core.verdict import Outcome, Verdict
 from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.faults import SensorFaults
 
@@ -50,7 +51,7 @@ class Estimator:
     def estimate(self, keyframes):
         self.may.wait(20)
         self.keyframes.append(len(keyframes))
-        return Estimate(self.result, dict.fromkeys((*TESTED, SHUTTER), 4.0), 0.3, 80)
+        return Estimate(self.result, dict.fromkeys((*TESTED, SHUTTER), Verdict((Outcome("evidence", 4.0),))), 0.3, 80)
 
 
 @pytest.fixture

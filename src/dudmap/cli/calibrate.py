@@ -51,7 +51,8 @@ def calibrate(
     if out is not None:
         replace(estimate.calibration, notes=tuple(remarks(estimate))).save(out)
     if as_json:
-        evidence = {name: value for name, value in estimate.evidence.items() if value == value}
+        evidence = {name: verdict.figure("evidence") for name, verdict in estimate.verdicts.items()}
+        evidence = {name: value for name, value in evidence.items() if value == value}
         answer(estimate.calibration.tree() | {"evidence": evidence, "gain": estimate.gain}, "", as_json=True)
         return
     console = plain_console()

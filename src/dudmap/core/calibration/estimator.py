@@ -21,6 +21,7 @@ from dudmap.core.calibration.depth_readout import ReadoutSearch, rectified_keyfr
 from dudmap.core.calibration.keyframes import ColorKeyframe
 from dudmap.core.calibration.vignetting import Brightness
 from dudmap.core.geometry.calibration import MAX_VIGNETTING, NUM_PARAMETERS, PARAMETERS, Calibration
+from dudmap.core.verdict import Outcome, Verdict
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "timing": ("delay", "readout"),
@@ -48,6 +49,9 @@ EVIDENCE = 3.0
 """Smallest decrease of the cost for a group, standard errors, of estimates on one half of the time tested on the other.
 Chance exceeds it once in 700 times."""
 
+NOT_PROVEN = "other values are not proven ({figure:+.1f} standard errors, {limit:g} are needed)"
+TOO_SMALL = "other values fit better by too small a share to be used ({figure:.1%}, {limit:.0%} are needed)"
+
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
@@ -55,13 +59,13 @@ class Estimate:
 
     Attributes:
         calibration: With standard deviations; given values without evidence.
-        evidence: Per group of ``TESTED``, and ``SHUTTER``: decrease of held-out costs, standard errors; NaN with too
-            few pairs.
+        verdicts: Per group of ``TESTED``, and ``SHUTTER``: whether it leaves its given values. Figure ``evidence``:
+            decrease of held-out costs, standard errors; NaN with too few pairs.
         gain: Share by which held-out costs decreased.
     """
 
     calibration: Calibration
-    evidence: dict[str, float]
+    verdicts: dict[str, Verdict]
     gain: float
     pairs: int
 
@@ -84,16 +88,21 @@ class _Trial:
         error = standard_error(gains, np.concatenate([first, second + 1 + first.max()]))
         return float(gains.sum() / max(error, 1e-12))
 
+    def verdict(self, other: "_Trial", group: str) -> Verdict:
+        """Whether this trial lets a group leave its given values: the improvement suffices, and neither cost gets
+        significantly worse."""
+        evidence, share = self.improvement(other)
+        worst = min(self.evidence(gains) for gains in self.gains(other))
+        return Verdict((
+            Outcome.of("evidence", evidence, EVIDENCE, NOT_PROVEN, at_least=True),
+            Outcome.of("share", share, MATERIAL[group], TOO_SMALL, at_least=True),
+            Outcome.of("worst", worst, -EVIDENCE, "the colours or the depths fit worse", at_least=True),
+        ))  # fmt: skip
+
     def improvement(self, other: "_Trial") -> tuple[float, float]:
         """Decrease of the cost: standard errors, and the smaller share of both halves."""
         shares = [1 - after.sum() / before.sum() for before, after in zip(other.costs, self.costs, strict=True)]
         return self.evidence(self.gains(other).sum(axis=0)), float(min(shares))
-
-    def proves(self, other: "_Trial", group: str) -> bool:
-        """Whether a group leaves its given values: the improvement suffices and no cost gets significantly worse."""
-        evidence, share = self.improvement(other)
-        worse = min(self.evidence(gains) for gains in self.gains(other)) <= -EVIDENCE
-        return evidence >= EVIDENCE and share >= MATERIAL[group] and not worse
 
 
 def _halves(keyframes: Sequence[ColorKeyframe], count: int) -> list[list[Pair]]:
@@ -139,22 +148,23 @@ class CalibrationEstimator:
         """
         halves = _halves(keyframes, SHUTTER_PAIRS)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:
-            unknown = dict.fromkeys((*TESTED, SHUTTER), float("nan"))
+            few = f"fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+            unknown = dict.fromkeys((*TESTED, SHUTTER), Verdict((Outcome("evidence", reason=few),)))
             return Estimate(self.given, unknown, 0.0, sum(map(len, halves)))
         known = self.given.depth_readout
-        readout, sigma, evidence, gain = self._depth_readout(halves)
+        readout, sigma, verdict, gain = self._depth_readout(halves)
         estimate = self._estimate_color(keyframes, readout)
         found, moved = estimate.calibration, (SHUTTER_PARAMETER,) if readout != known else ()
         late = max(found.delay, 0.0) if any(frame.color_offset for frame in keyframes) else 0.0
         return Estimate(
             replace(found, estimated=(*found.estimated, *moved), depth_late=late, depth_readout_sigma=sigma),
-            estimate.evidence | {SHUTTER: evidence},
+            estimate.verdicts | {SHUTTER: verdict},
             1 - (1 - gain) * (1 - estimate.gain),
             estimate.pairs,
         )
 
-    def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, float, float]:
-        """Depth readout (s), its standard deviation, evidence, and relative decrease of the cost."""
+    def _depth_readout(self, halves: list[list[Pair]]) -> tuple[float, float, Verdict, float]:
+        """Depth readout (s), its standard deviation, verdict, and relative decrease of the cost."""
         given, adjustment, timing = self.given, self.adjustment, mask_of(GROUPS["timing"])
         with ThreadPoolExecutor(self.workers) as pool:
             searches = list(pool.map(lambda pairs: ReadoutSearch(pairs, given, adjustment, timing, STRIDE), halves))
@@ -164,15 +174,15 @@ class CalibrationEstimator:
             _Trial(timing, [], [other.costs(of_one), one.costs(of_other)], sets)
             for of_one, of_other in ((one.given, other.given), (one.best, other.best))
         )
-        evidence, gain = after.improvement(before)
-        found, is_proven = np.array([one.best.depth_readout, other.best.depth_readout]), after.proves(before, SHUTTER)
+        verdict, found = after.verdict(before, SHUTTER), np.array([one.best.depth_readout, other.best.depth_readout])
+        is_proven, evidence = verdict.accepted, verdict.figure("evidence")
         readout = float(found.mean()) if is_proven else given.depth_readout
         apart = np.sqrt(np.mean(np.square(found - readout)))
         # for a nearly quadratic cost, a decrease by E standard errors determines the minimum to 1 / (2 E) of its
         # distance
         unsure = (readout - given.depth_readout) / (2 * evidence) if is_proven else np.hypot(one.sigma, other.sigma) / 2
         sigma = float(np.hypot(apart, unsure))
-        return readout, sigma, evidence, gain if is_proven else 0.0
+        return readout, sigma, verdict, verdict.figure("share") if is_proven else 0.0
 
     def _estimate_color(self, keyframes: Sequence[ColorKeyframe], depth_readout: float) -> Estimate:
         rectified = CalibrationEstimator(self.given.with_depth_readout(depth_readout), self.sensor, self.workers)
@@ -186,7 +196,7 @@ class CalibrationEstimator:
         fits = [self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given))[0] for pairs in halves]
         costs = [self.adjustment.costs(halves[1 - n], fits[1 - n], self.adjustment.levels[-1:]) for n in (0, 1)]
         start = _Trial(~everything, fits, costs, halves)
-        proven, evidence = self._proven(halves, start)
+        proven, verdicts = self._proven(halves, start)
         pairs = PairSet([*within[0], *within[1], *select_across(keyframes[:middle], keyframes[middle:], PAIRS // 2)])
         free, levels = proven.free, self.adjustment.levels
         fit, covariance = Fit.tracked(pairs, proven.fits[1].calibration), None
@@ -199,16 +209,16 @@ class CalibrationEstimator:
             sigma[free] = np.sqrt(np.diag(covariance)[free])
         sigma = np.hypot(self._disagreement(halves, proven.fits) * sigma, found.step_to(freed.calibration))
         estimated = tuple(name for name, moved in zip(PARAMETERS, free, strict=True) if moved)
-        vignetting, vignetting_sigma, evidence["vignetting"] = self._vignetting(proven, Brightness.of(pairs, fit))
+        vignetting, vignetting_sigma, verdicts["vignetting"] = self._vignetting(proven, Brightness.of(pairs, fit))
         if vignetting != self.given.vignetting:
             estimated = (*estimated, "vignetting")
         gain = 1 - float(np.concatenate(proven.costs, axis=1).mean() / np.concatenate(start.costs, axis=1).mean())
         found = replace(
             found, sigma=sigma, estimated=estimated, vignetting=vignetting, vignetting_sigma=vignetting_sigma
         )
-        return Estimate(found, evidence, gain, len(pairs))
+        return Estimate(found, verdicts, gain, len(pairs))
 
-    def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, float]:
+    def _vignetting(self, proven: _Trial, everything: Brightness) -> tuple[float, float, Verdict]:
         given = self.given.vignetting
         halves = [Brightness.of(pairs, fit) for pairs, fit in zip(proven.halves, proven.fits, strict=True)]
         found = [half.fitted()[0] for half in halves]
@@ -216,8 +226,13 @@ class CalibrationEstimator:
         evidence = proven.evidence(np.concatenate(gains))
         vignetting, sigma = everything.fitted()
         sigma = float(np.hypot(sigma, (found[0] - found[1]) / 2))
-        is_proven = evidence >= EVIDENCE and EVIDENCE * sigma <= abs(vignetting - given) <= MAX_VIGNETTING
-        return vignetting if is_proven else given, sigma, evidence
+        change = abs(vignetting - given)
+        verdict = Verdict((
+            Outcome.of("evidence", evidence, EVIDENCE, NOT_PROVEN, at_least=True),
+            Outcome.of("change", change, EVIDENCE * sigma, "{figure:.3f} is within its error", at_least=True),
+            Outcome.of("size", change, MAX_VIGNETTING, "{figure:.2f} is more than a lens has"),
+        ))  # fmt: skip
+        return vignetting if verdict.accepted else given, sigma, verdict
 
     def _disagreement(self, halves: list[PairSet], starts: list[Fit]) -> float:
         """Factor >= 1 for standard deviations: rms difference of both halves."""
@@ -229,41 +244,42 @@ class CalibrationEstimator:
         squares = float(apart @ np.linalg.solve(covariance + other_covariance, apart))
         return max(1.0, np.sqrt(squares / NUM_PARAMETERS))
 
-    def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
-        trial, evidence = start, dict[str, float]()
+    def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, Verdict]]:
+        trial, verdicts = start, dict[str, Verdict]()
         while rest := [name for name, members in GROUPS.items() if not trial.free[mask_of(members)].all()]:
             trials = {name: self._trial(halves, trial, [name]) for name in rest}
-            evidence |= {name: other.improvement(trial)[0] for name, other in trials.items()}
-            proven = [name for name in rest if trials[name].proves(trial, name)]
+            verdicts |= {name: other.verdict(trial, name) for name, other in trials.items()}
+            proven = [name for name in rest if verdicts[name].accepted]
             if not proven:
                 break
-            best = max(proven, key=lambda name: evidence[name])
+            best = max(proven, key=lambda name: verdicts[name].figure("evidence"))
             trial = trials[best]
         if "geometry" in rest and "center" in rest:
             rest.remove("center")  # part of the geometry
         if len(rest) > 1:
             trial, names = self._together(halves, trial, rest)
-            evidence |= names
+            verdicts |= names
         if trial.free[mask_of(GROUPS["geometry"])].all():
-            evidence["center"] = max(evidence["center"], evidence["geometry"])
-        return trial, evidence
+            both = verdicts["center"], verdicts["geometry"]
+            verdicts["center"] = max(both, key=lambda verdict: verdict.figure("evidence"))
+        return trial, verdicts
 
     def _together(
         self, halves: list[PairSet], before: "_Trial", names: Sequence[str]
-    ) -> tuple["_Trial", dict[str, float]]:
-        """Groups that explain the pairs only jointly, such as focal length and delay, and the evidence of each given
-        the others.
+    ) -> tuple["_Trial", dict[str, Verdict]]:
+        """Groups that explain the pairs only jointly, such as focal length and delay, and the verdict on each given the
+        others.
 
         All groups are freed, then fixed one by one.
         """
         trial, names = self._trial(halves, before, names), list(names)
-        while len(names) > 1 and all(trial.proves(before, name) for name in names):
+        while len(names) > 1 and all(trial.verdict(before, name).accepted for name in names):
             fewer = {name: self._trial(halves, before, [n for n in names if n != name]) for name in names}
-            evidence = {name: trial.improvement(other)[0] for name, other in fewer.items()}
-            weakest = min(names, key=lambda name: evidence[name])
-            needless = [name for name in (weakest, *names) if not trial.proves(fewer[name], name)]
+            verdicts = {name: trial.verdict(other, name) for name, other in fewer.items()}
+            weakest = min(names, key=lambda name: verdicts[name].figure("evidence"))
+            needless = [name for name in (weakest, *names) if not verdicts[name].accepted]
             if not needless:
-                return trial, evidence
+                return trial, verdicts
             names.remove(needless[0])
             trial = fewer[needless[0]]
         return before, {}

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dudmap.core.calibration.estimator import EVIDENCE, MIN_PAIRS, SHUTTER, SHUTTER_PARAMETER, TESTED, Estimate
+from dudmap.core.calibration.estimator import SHUTTER, SHUTTER_PARAMETER, TESTED, Estimate
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.camera import Camera
 
@@ -34,34 +34,29 @@ def findings(estimate: "Estimate") -> list[str]:
     """One sentence per group of parameters: estimated or assumed, test result, and standard deviations."""
     out = [_shutter_finding(estimate)]
     for name, members in TESTED.items():
-        evidence, known = estimate.evidence[name], _sigma(estimate.calibration, members)
+        verdict, known = estimate.verdicts[name], _sigma(estimate.calibration, members)
+        evidence = verdict.figure("evidence")
         if np.isnan(evidence):
-            said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+            said = f"{ASSUMED}: {verdict.reason}"
         elif members[0] in estimate.calibration.estimated:
             said = f"estimated; other images fit {evidence:.1f} standard errors better; standard deviations {known}"
-        elif evidence >= EVIDENCE:
-            said = (
-                f"assumed as given; tested: other values fit {evidence:.1f} standard errors better, but by too small a "
-                f"share to be used; standard deviations {known}"
-            )
         else:
-            said = (
-                f"assumed as given; tested: other values are not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} "
-                f"are needed); standard deviations, if they are nearly right, {known}"
-            )
+            known = f"standard deviations, if the given values are nearly right, {known}"
+            said = f"assumed as given; tested: {verdict.reason}; {known}"
         out.append(f"colour camera, {name}: {said}")
     return out
 
 
 def _shutter_finding(estimate: "Estimate") -> str:
-    evidence, readout = estimate.evidence[SHUTTER], 1000 * estimate.calibration.depth_readout
+    verdict, readout = estimate.verdicts[SHUTTER], 1000 * estimate.calibration.depth_readout
+    evidence = verdict.figure("evidence")
     taken = f"rows are taken to be read out within {readout:.1f} ms"
     if np.isnan(evidence):
-        said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
+        said = f"{ASSUMED}: {verdict.reason}"
     elif SHUTTER_PARAMETER in estimate.calibration.estimated:
         said = f"estimated; other images fit {evidence:.1f} standard errors better; {taken}"
     else:
-        said = f"not proven ({evidence:+.1f} standard errors, {EVIDENCE:g} are needed); {taken}"
+        said = f"{verdict.reason}; {taken}"
     return f"depth camera, {SHUTTER}: {said}"
 
 
