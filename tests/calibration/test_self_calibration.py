@@ -146,7 +146,7 @@ def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator):
     """Also the frames that were made ready before it was known."""
     estimator.may.set()
     faulty, exact = recording(**UNREGISTERED), recording()
-    config = Config().override(["loops.keep_gap=1", "volume.min_weight=1"])
+    config = Config().override(["loops.keep_gap=2", "volume.min_weight=1"])
     slam = Slam(SMALL, config)
     views = [slam.prepare(faulty[index]) for index in range(FRAMES)]
     results, before = [], np.nan
