@@ -281,7 +281,8 @@ class YoungMap(Stateful):
         moving = propagate_to_segments(motion.after)
         hidden = moving if older.moving is None else moving & ~older.moving
         agrees = se3.agree(T, older.T_world_camera, *self._same_pose)
-        return not agrees or exceeds_noise_share(hidden, older.view.labelled)
+        moved = hidden if agrees else moving  # without moving surface, depth and image disagree, by their calibration
+        return exceeds_noise_share(moved, older.view.labelled)
 
     def _revised(self, compared: list[tuple[StartFrame, StartFrame]]) -> list[StartFrame]:
         """Compared frames in the world of the oldest one, with their earlier moving pixels if their poses agree.
