@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline import frame_source
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.errors import CameraError, DudmapError, FrameError
@@ -31,6 +32,7 @@ def slowed(slam, monkeypatch, seconds):
         return fast(self, frame)
 
     monkeypatch.setattr(slam, "process", slow)
+    monkeypatch.setattr(frame_source, "MAX_DELAY", frame_source.MAX_WAIT)
 
 
 def test_a_run_in_time_drops_nothing(slam, sequence, tmp_path, capsys):
