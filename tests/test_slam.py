@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.slam import Slam
-from dudmap.errors import FrameError
+from dudmap.errors import ConfigError, FrameError
 from dudmap.lab import synthetic
 from off_course import LIMIT, off_course
 
@@ -243,3 +244,13 @@ def test_importing_dudmap_is_light():
     code = "import sys, dudmap; print([name for name in ('numba', 'cv2', 'scipy', 'trimesh') if name in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+@pytest.mark.parametrize(("arguments", "expected"), [
+    ({"poses": "gven"}, "poses is 'gven', expected 'estimated', 'given', 'refined'"),
+    ({"config": {"volume": {}}}, "config is a dict, expected a Config"),
+    ({"saved_map": "office"}, "saved_map is a str, expected a SavedMap: SavedMap.load"),
+])  # fmt: skip
+def test_an_argument_of_another_kind_is_refused_by_name(arguments, expected):
+    with pytest.raises(ConfigError, match=re.escape(expected)):
+        Slam(SMALL, **arguments)

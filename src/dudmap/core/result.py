@@ -5,7 +5,7 @@ from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from dudmap.core.tracking.motion_model import GivenRole
 from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import TrackingResult
 from dudmap.core.verdict import Verdict
+from dudmap.errors import ConfigError
 
 
 class Status(StrEnum):
@@ -167,6 +168,18 @@ class SlamArguments:
     timed: bool
     ignore: NDArray[np.bool_] | None
     poses: GivenRole
+
+    def __post_init__(self) -> None:
+        """Refuse a configuration or a role of poses that is none.
+
+        Raises:
+            ConfigError: One of them is.
+        """
+        if not isinstance(self.config, Config):
+            found = type(self.config).__name__
+            raise ConfigError(f"config is a {found}, expected a Config: Config(...), Config.load(file) or None")
+        if self.poses not in (roles := get_args(GivenRole)):
+            raise ConfigError(f"poses is {self.poses!r}, expected {', '.join(map(repr, roles))}")
 
 
 class SlamResults:

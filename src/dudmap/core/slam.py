@@ -47,6 +47,7 @@ from dudmap.core.tracking.quality_monitor import QualityMonitor
 from dudmap.core.tracking.tracker import Tracker
 from dudmap.core.verdict import Outcome, Verdict
 from dudmap.core.young_map import StartFrame, YoungMap
+from dudmap.errors import ConfigError
 
 
 class Slam(SlamResults, Stateful):
@@ -69,6 +70,9 @@ class Slam(SlamResults, Stateful):
         poses: Role of the poses passed with frames: the result (``given``), or the start of registration (``refined``).
         ignore: (H, W) bool, pixels of the depth or colour image that are never used.
         cues: Further evidence of motion, not stored with the state.
+
+    Raises:
+        ConfigError: An argument is of another kind.
 
     Attributes:
         shed: Work to omit from the next frames, to save time. Labels and fusion are omitted from every second frame
@@ -111,7 +115,9 @@ class Slam(SlamResults, Stateful):
         poses: GivenRole = "estimated",
         cues: Sequence[Cue] = (),
     ) -> None:
-        self.config = config = config or Config()
+        if not isinstance(saved_map, SavedMap | None):
+            raise ConfigError(f"saved_map is a {type(saved_map).__name__}, expected a SavedMap: SavedMap.load(folder)")
+        self.config = config = Config() if config is None else config
         ignore = None if ignore is None else copied(ignore, "mask of ignored pixels", dtype=None)
         self.arguments = SlamArguments(camera, config, calibration, live, localize, max_blocks, timed, ignore, poses)
         self.first_pass = first_pass
