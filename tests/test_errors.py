@@ -25,7 +25,7 @@ def test_every_class_has_a_paragraph_that_says_what_to_do(kind):
     text = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
     section = re.search(rf"^## `{kind.__name__}`\n(.*?)(?=^## |\Z)", text, flags=re.MULTILINE | re.DOTALL)
     assert section is not None, f"docs/errors.md lacks {kind.__name__}"
-    assert "**What to do:**" in section[1]
+    assert "**Remedy:**" in section[1]
 
 
 def test_the_page_names_no_class_that_does_not_exist():
