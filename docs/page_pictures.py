@@ -33,7 +33,7 @@ WORLDS = (
 
 
 def main() -> None:
-    """Write all pictures into the folder that is named, by default that of the documentation."""
+    """Write all pictures into the named folder, by default into the documentation."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS
     (folder / "figures").mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.hstack([world(*row) for row in WORLDS])).save(folder / "synthetic.jpg", quality=88)

@@ -30,7 +30,7 @@ GREY, SKY = "#d9d9d9", "#dcebf7"
 
 
 def main() -> None:
-    """Write all pictures into the folder that is named, by default that of the documentation."""
+    """Write all pictures into the named folder, by default into the documentation."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else IMAGES
     for name, figure in (
         ("concept-tsdf.png", tsdf_slice()),

@@ -39,7 +39,7 @@ def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Conso
 
 @cache
 def stderr_console() -> "Console":
-    """Console on stderr of progress bars and log."""
+    """Console on stderr for progress bars and log messages."""
     return plain_console(stderr=True)
 
 

@@ -73,7 +73,7 @@ def draw_pair(seed: int, number: int) -> dict[str, Any]:
 
 
 def rendered_pair(pair: dict[str, Any]) -> tuple[list[SyntheticSequence], list[TrueChange]]:
-    """Recordings and true changes of a pair, without things that find no place."""
+    """Recordings and true changes of a pair. The last changes are left out if the room has no place for them."""
     while True:
         try:
             return visits(**pair)

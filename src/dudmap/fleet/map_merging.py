@@ -90,7 +90,7 @@ class MapPair:
     Attributes:
         T_a_b: (4, 4) world of b to a, None if not to be merged.
         reason: Why not; empty if merged.
-        hypothesis, alignment, agreement: Of the accepted pose, or the first tried.
+        hypothesis, alignment, agreement: Metrics of the accepted pose, else of the first one tried.
     """
 
     T_a_b: NDArray[np.float64] | None

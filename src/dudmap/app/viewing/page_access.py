@@ -71,7 +71,7 @@ class PageAccess:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
 
     def guard(self, server: Any) -> None:  # noqa: ANN401 - viser.ViserServer, of an optional package
-        """Close every forbidden connection to a viser server before anything is sent; bars viser's relay."""
+        """Close every forbidden connection to a viser server before anything is sent; blocks viser's relay."""
         connections = server._websock_server
 
         async def check(client: Any) -> None:  # noqa: ANN401 - viser.infra.WebsockClientConnection

@@ -210,7 +210,7 @@ class _System:
 class Adjustment:
     """Robust Gauss-Newton over the calibration, the poses of the frames, and the light of the pairs.
 
-    All pairs of a frame determine its pose, and so the translation between the cameras, which resembles a pose error.
+    A frame has one pose in all its pairs: a pose per pair would absorb the translation between the cameras.
     ``given``: initial calibration, mean of the priors. ``levels``: halvings of the colour images, coarse to fine.
     """
 

@@ -32,7 +32,7 @@ USED_AFTER = 60
 class SelfCalibration(Stateful):
     """Estimates the calibration repeatedly during tracking, in another process.
 
-    Each starts from the given calibration, independent of the present one, with all keyframes of the submap.
+    Each estimate starts from the given calibration, not from the present one, with all keyframes of the submap.
 
     Attributes:
         estimate: The last finished estimate; None before.

@@ -23,7 +23,7 @@ class Brightness:
     """Brightness of common surfaces in both frames of P pairs.
 
     The log ratio is the log ratio of the exposures minus the vignetting times the difference of the squared distances
-    to the centre, on a wall even for wrong poses.
+    to the centre. On a wall this holds even for wrong poses.
 
     Attributes:
         numbers: (P, 2) int64, the frames of every pair.

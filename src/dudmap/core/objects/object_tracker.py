@@ -211,7 +211,7 @@ class ObjectTracker(Stateful):
     def _joined(
         self, numbers: NDArray[np.int32], predicted: NDArray[np.uint8], level: Level
     ) -> list[tuple[NDArray[np.intp], float]]:
-        """Pixels and surface of each object: a region with near fragments, of the same prediction or much smaller."""
+        """Pixels and surface of each object: a region and its near fragments (same prediction, or much smaller)."""
         regions = measured_regions(numbers, level)
         if regions is None:
             return []

@@ -36,8 +36,8 @@ class LoopCorrector(Stateful):
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Measured motion from the stored frame nearest in time to a keyframe to the newest one; None if they are the
-        same.
+        """Edge between two stored frames: the one nearest in time to the keyframe, and the newest. None if they are
+        the same.
 
         ``T_tracked``: tracked pose (4, 4) of the recognised frame. ``T_measured``: its pose in the map at the time of
         the keyframe.

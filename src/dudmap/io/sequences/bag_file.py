@@ -110,7 +110,7 @@ class BagFile:
         return None
 
     def times(self, connection: "Connection") -> MessageTimes:
-        """Times of the messages of a topic with headers, from the index and first bytes; stamps of compressed bags are
+        """Header times of the messages of a topic, from the index and the first bytes. Times of compressed bags are
         estimated."""
         rows = list(self._ros1_entries(connection) if self._ros1 else self._ros2_entries(connection))
         recorded, first = np.unique(np.array([time for time, _ in rows], dtype=np.int64), return_index=True)

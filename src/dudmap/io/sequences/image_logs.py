@@ -140,8 +140,8 @@ class SensRecording(_FrameLog):
 class KlgRecording(_FrameLog):
     """``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
 
-    Depth is in millimetres (raw or zlib), colour raw or JPEG; no intrinsics. The size is given, the first JPEG image's,
-    or 640x480.
+    Depth is in millimetres (raw or zlib), colour raw or JPEG; no intrinsics. The image size is
+    given, or taken from the first JPEG image, else 640x480.
     """
 
     format = "ElasticFusion .klg"
