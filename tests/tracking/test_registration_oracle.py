@@ -237,7 +237,8 @@ def test_a_much_worse_registration_is_doubted():
         monitor.accept(result(0.002))
     assert doubt(result(0.004)) == ""  # exp(6 * 0.12) = 2.05
     assert "off the map" in doubt(result(0.0042))
-    assert "the image differs" in doubt(result(0.002, color=0.042))
+    assert doubt(result(0.002, color=0.049)) == ""  # exp(6 * 0.153) = 2.5
+    assert "the image differs" in doubt(result(0.002, color=0.051))
     assert doubt(result(0.002, 0.3)) == ""
     monitor.lose()
     assert "fall on the map" in doubt(result(0.002, 0.3))

@@ -164,16 +164,16 @@ UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
 INNOVATION = 6.0
 """Largest rise of a residual over its median, in standard deviations of its logarithm. None of 2284 residuals of six
 recordings rose by more."""
-SPREADS = 0.12, 0.23
+SPREADS, COLOR_SPREADS = (0.12, 0.23), (0.153, 0.23)
 """Smallest and largest standard deviation of the logarithm; on six recordings its median is 0.10 to 0.27. Limits are 2
-to 4 times the median."""
+to 4 times the median, 2.5 to 4 times for intensities, whose difference also rises with new texture in view."""
 
 
-def _highest(values: Sequence[float]) -> float:
+def _highest(values: Sequence[float], spreads: tuple[float, float]) -> float:
     """Largest expected residual: the median, raised by the innovation in log space."""
     logarithms = np.log(np.maximum(values, 1e-6))
     median = np.median(logarithms)
-    spread = np.clip(1.4826 * np.median(np.abs(logarithms - median)), *SPREADS)
+    spread = np.clip(1.4826 * np.median(np.abs(logarithms - median)), *spreads)
     return float(np.exp(median + INNOVATION * spread))
 
 
@@ -272,7 +272,8 @@ class QualityMonitor(Stateful):
         """Limits from the configuration and earlier registrations; NaN before there are enough."""
         config, known = self.config, len(self._residuals) >= MIN_HISTORY
         residual, color = (
-            _highest(values) if known and values else np.nan for values in (self._residuals, self._colors)
+            _highest(values, spreads) if known and values else np.nan
+            for values, spreads in ((self._residuals, SPREADS), (self._colors, COLOR_SPREADS))
         )
         overlap = statistics.median(self._shares) if known and self.recovering else np.nan
         return Limits(config.tracker, config.sensor, RULES, mostly_dynamic, blind, 1000 * residual, color, overlap)
