@@ -144,13 +144,17 @@ def test_sigterm_ends_a_run_and_names_how_to_go_on(room, tmp_path):
 
 
 PROGRAM = """
-import os, signal, sys, time
+import select, sys
 from dudmap import interruption
 interruption.listen()
-print("ready", flush=True)
 try:
     with interruption.postponed():
-        time.sleep(float(sys.argv[1]))
+        print("ready", flush=True)
+        taken = False
+        while not select.select([sys.stdin], [], [], 0.02)[0]:
+            if not taken and interruption._Request.signal:
+                taken = True
+                print("taken", flush=True)
         print("written", flush=True)
 except KeyboardInterrupt:
     print("asked", interruption.name(), flush=True)
@@ -158,39 +162,48 @@ sys.exit(interruption.exit_code(0))
 """
 
 
-def program(seconds, *signals, pause=0.0):
-    """Exit code and output of a program that writes for so many seconds and is sent signals meanwhile."""
-    process = subprocess.Popen([sys.executable, "-c", PROGRAM, str(seconds)], stdout=subprocess.PIPE, text=True)
+def program(*signals, pause=0.0, completes=True):
+    """Exit code and output of a program that is sent signals while it writes, which it completes or never does."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", PROGRAM], **pipes)
     assert process.stdout.readline() == "ready\n"
-    time.sleep(0.3)
-    for number in signals:
+    for n, number in enumerate(signals):
         process.send_signal(number)
-        time.sleep(pause)
-    out, _ = process.communicate(timeout=60)
-    return process.returncode, out.split("\n")[:-1]
+        if n == 0 and pause:
+            assert process.stdout.readline() == "taken\n"
+            time.sleep(pause)
+    if completes:
+        time.sleep(0.3)
+        process.stdin.write("go on\n")
+        process.stdin.flush()
+    said = process.stdout.read()
+    process.stdin.close()
+    process.stdout.close()
+    return process.wait(timeout=60), [line for line in said.splitlines() if line != "taken"]
 
 
 def test_what_is_written_is_completed():
-    assert program(1.5) == (0, ["written"])
-    assert program(1.5, signal.SIGTERM) == (143, ["written", "asked SIGTERM"])
-    assert program(1.5, signal.SIGHUP) == (129, ["written", "asked SIGHUP"])
-    assert program(1.5, signal.SIGINT) == (0, ["written", "asked Ctrl-C"])
+    assert program() == (0, ["written"])
+    assert program(signal.SIGTERM, pause=0.01) == (143, ["written", "asked SIGTERM"])
+    assert program(signal.SIGHUP, pause=0.01) == (129, ["written", "asked SIGHUP"])
+    assert program(signal.SIGINT, pause=0.01) == (0, ["written", "asked Ctrl-C"])
 
 
 def test_a_second_signal_ends_at_once_unless_it_is_the_echo_of_the_first():
-    assert program(20, signal.SIGTERM, signal.SIGTERM, pause=1.5) == (-signal.SIGTERM, [])
-    assert program(20, signal.SIGTERM, signal.SIGINT, pause=1.5) == (143, ["asked SIGTERM"])
-    assert program(1.5, signal.SIGTERM, signal.SIGTERM) == (143, ["written", "asked SIGTERM"])  # as timeout sends them
-    assert program(3, signal.SIGTERM, signal.SIGHUP, pause=1.2) == (143, ["written", "asked SIGTERM"])
+    assert program(signal.SIGTERM, signal.SIGTERM, pause=1.5, completes=False) == (-signal.SIGTERM, [])
+    assert program(signal.SIGTERM, signal.SIGINT, pause=1.5, completes=False) == (143, ["asked SIGTERM"])
+    assert program(signal.SIGTERM, signal.SIGTERM) == (143, ["written", "asked SIGTERM"])  # as timeout sends them
+    assert program(signal.SIGTERM, signal.SIGHUP, pause=1.2) == (143, ["written", "asked SIGTERM"])
 
 
 def test_what_is_ignored_stays_ignored():
     """As by nohup."""
     command = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n{PROGRAM}"
-    process = subprocess.Popen([sys.executable, "-c", command, "1"], stdout=subprocess.PIPE, text=True)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-c", command], **pipes)
     assert process.stdout.readline() == "ready\n"
     process.send_signal(signal.SIGHUP)
-    assert process.communicate(timeout=60)[0] == "written\n"
+    assert process.communicate("go on\n", timeout=60)[0] == "written\n"
     assert process.returncode == 0
 
 
