@@ -19,7 +19,8 @@ EYES = 1.45
 """Height of the camera, metres."""
 WALLS, FLOORS = ("wallpaper", "brick", "plaster", "wood"), ("checks", "parquet", "wood")
 """Textures. Each surface has its own part and its own scale of one, across and down: in the same scale the few pictures
-would repeat exactly, and a place could not be told from the one a period farther on, which no building asks for."""
+would repeat exactly, and a place could not be told from the one a period farther on, which no building asks for. Wear
+and stains darken and lighten each by up to a third."""
 
 
 def ring_corridor(
@@ -156,7 +157,8 @@ def _furniture(door: float, wall: float, far: float, rng: np.random.Generator) -
 def _material(rng: np.random.Generator, textures: tuple[str, ...]) -> Material:
     (red, green, blue), (u, v) = rng.uniform(0.75, 1.15, 3).tolist(), rng.uniform(0, 1, 2).tolist()
     scale = rng.uniform(0.3, 0.6, 2)
-    return Material(str(rng.choice(textures)), (float(scale[0]), float(scale[1])), (u, v), (red, green, blue))
+    scales = float(scale[0]), float(scale[1])
+    return Material(str(rng.choice(textures)), scales, (u, v), (red, green, blue), variation=0.3)
 
 
 def _stripes(rng: np.random.Generator) -> Material:

@@ -50,7 +50,7 @@ TIMES = (
 def lost_and_found():
     """A room, a jump to another part of it that begins a second map, and the way back, which joins the maps; the colour
     is taken after the depth."""
-    yaw = np.concatenate([np.zeros(6), np.full(9, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 22)), np.zeros(10)])
+    yaw = np.concatenate([np.zeros(6), np.full(9, -80.0), -78 * np.cos(np.linspace(0, np.pi / 2, 22)), np.zeros(10)])
     base = synthetic.sequence(movers=(), frames=len(yaw), seed=1, camera=SMALL, camera_path="slow", fps=15.0,
                               noise="realsense")  # fmt: skip
     Ts, up = base.ground_truth.Ts_world_camera.copy(), base.scene.home[:3, 1]

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from dudmap.lab.synthetic.folder import write_folder
 from dudmap.lab.synthetic.render import Renderer
 from dudmap.lab.synthetic.rooms import SCENES, build_scene
 from dudmap.lab.synthetic.sensors import SENSORS
+from dudmap.lab.synthetic.surface import tessellate
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 TINY = Camera(52.5, 52.5, 31.5, 23.5, 64, 48)
@@ -103,6 +105,29 @@ def test_depth_of_every_scene_lies_on_its_surfaces(scene):
     assert recording.scene.clearance(recording.ground_truth.Ts_world_camera[:, :3, 3]).min() > 0.05
 
 
+def test_a_picture_is_not_mirrored_on_any_side_of_a_box():
+    """The same picture, which is its mirror image nowhere, on all four sides and in the colours of the true surface."""
+    picture = parts.Material("poster", (1, 1), (0.5, 0.5), variation=0, faces=False)
+    scene = replace(
+        build_scene("box"), primitives=[parts.box((0, 0, 0), (1, 1, 1), picture)], lights=(parts.Light((0, 0, 9), 0),)
+    )
+    renderer, nothing = Renderer(scene, scene.primitives), (np.zeros((0, 4, 4)), np.zeros(0, bool))
+    eyes = ((0, -2.3, 0), (2.3, 0, 0), (0, 2.3, 0), (-2.3, 0, 0))
+    front, *others = (renderer.render(TINY, parts.look_at(eye, (0, 0, 0)), *nothing).color for eye in eyes)
+    assert np.abs(front - front[:, ::-1]).max() > 50
+    for color in others:
+        np.testing.assert_allclose(color, front, atol=1)
+    surface = tessellate(scene.primitives, 0.02, ((-1, -1, -1), (1, 1, 1)), renderer.atlas)
+    colors = []
+    for axis, side in ((1, -1), (0, 1), (1, 1), (0, -1)):
+        on = surface.normals[:, axis] * side > 0.9
+        right = surface.vertices[on, 1 - axis] * (side if axis == 0 else -side)
+        order = np.lexsort((surface.vertices[on, 2].round(4), right.round(4)))
+        colors.append(surface.colors[on][order].astype(int))
+    assert np.median(np.abs(np.array(colors) - colors[0]), axis=(1, 2)).max() <= 1
+    assert (np.abs(np.array(colors) - colors[0]) > 8).mean() < 0.03  # a texel's border may fall to either side
+
+
 def test_points_moved_by_the_true_poses_land_on_the_same_surface():
     recording = small(camera_path="orbit", frames=30, movers=())
     first, last = recording[0], recording[29]
@@ -134,6 +159,8 @@ def test_sensor_noise_is_the_same_with_and_without_movers():
     far = ~np.pad(mask, 30)[30:-30, 30:-30]
     for shift in range(-30, 31):
         far &= ~np.roll(mask, shift, axis=1)
+    for shift in (-1, 1):  # colours at a border are averaged over both sides
+        far &= ~np.roll(mask, shift, axis=0)
     assert far.mean() > 0.2
     assert np.array_equal(recording[1].color[~mask & far], twin[1].color[~mask & far])
     assert (recording[1].depth != twin[1].depth)[far].mean() < 0.01

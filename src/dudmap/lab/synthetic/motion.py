@@ -120,11 +120,11 @@ LIMBS = ("torso", "head", "arm_l", "arm_r", "forearm_l", "forearm_r", "thigh_l",
 TORSO, HEAD, ARM_L, ARM_R, FOREARM_L, FOREARM_R, THIGH_L, THIGH_R, SHANK_L, SHANK_R = range(len(LIMBS))
 
 OUTFITS = (
-    ("stripes", (1.0, 1.0, 1.0), (0.45, 0.55, 0.85)),
+    ("stripes", (1.0, 1.0, 1.0), (0.48, 0.55, 0.72)),
     ("plaid", (1.0, 0.85, 0.8), (0.75, 0.68, 0.55)),
-    ("checks", (0.6, 0.9, 0.7), (0.4, 0.4, 0.45)),
+    ("checks", (0.74, 0.83, 0.86), (0.4, 0.4, 0.45)),
     ("wallpaper", (1.1, 0.75, 0.6), (0.5, 0.6, 0.5)),
-    ("denim", (1.2, 0.6, 0.55), (0.35, 0.4, 0.6)),
+    ("denim", (1.0, 0.66, 0.58), (0.38, 0.42, 0.55)),
 )
 
 

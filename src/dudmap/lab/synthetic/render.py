@@ -85,7 +85,9 @@ class Renderer:
         over_rows(rows.shape[1], kernels.trace, *bins, *geometry)
         if not with_color:
             return Rendering(depth, ids, None, None)
-        lights = np.array([[*light.position, light.strength, light.falloff] for light in self._scene.lights])
+        lights = np.array(
+            [[*light.position, light.strength, light.falloff, light.softness] for light in self._scene.lights]
+        )
         lights[:, :3] = lights[:, :3] @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
         up = np.append(T_camera_world[:3, 2], self._scene.ambient)
         color = np.zeros((*camera.shape, 3), dtype=np.float32)

@@ -171,11 +171,15 @@ def torus(center: Vector, axis: Vector, ring: float, tube: float, material: Mate
 
 @dataclass(frozen=True)
 class Light:
-    """Point light: position (world frame, metres), strength, fall-off per square metre."""
+    """Light: position (world frame, metres), strength, fall-off per square metre.
+
+    ``softness`` is the sine of the angle by which it reaches surfaces that face away from its centre; 0 for a point.
+    """
 
     position: tuple[float, float, float]
     strength: float = 0.6
     falloff: float = 0.04
+    softness: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)

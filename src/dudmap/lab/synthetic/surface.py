@@ -103,7 +103,8 @@ def _revolved(primitive: Primitive, detail: float) -> tuple[Points, Points, Face
 def _colors(primitive: Primitive, local: Points, normals: Points, detail: float, atlas: NDArray[np.int32]) -> Points:
     material = primitive.material
     axis = np.abs(normals).argmax(axis=1)
-    s = np.where(axis == 0, local[:, 1], local[:, 0])
+    s = np.where(axis == 0, local[:, 1] * np.sign(normals[:, 0]), local[:, 0])
+    s = np.where(axis == 1, -s * np.sign(normals[:, 1]), s)
     w = np.where(axis == 2, -local[:, 1], -local[:, 2])
     side = np.where(axis == 0, 0.37 * np.sign(normals[:, 0]), np.where(axis == 1, 0.71 * np.sign(normals[:, 1]), 0.0))
     u = s * material.scale[0] + material.offset[0] + side * float(material.faces)

@@ -6,11 +6,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.lab.synthetic import prints
+
 Image = NDArray[np.float64]
 Maker = Callable[[np.random.Generator], Image]
 
 SIZE = 512  # must equal kernels.raytracing.TEXTURE_SIZE
-HALF = SIZE // 2
 LEVELS = 10
 
 
@@ -51,21 +52,31 @@ def _noise(mean: float, *parts: tuple[float, ...], color: tuple[float, float, fl
 
 
 def _wallpaper(rng: np.random.Generator) -> Image:
+    """Pale stripes with painted sprigs, each of which leans, spreads and is tinted in its own way."""
     x, y = _grid()
-    stripes = np.clip(4 * np.sin(2 * np.pi * 4 * x), -1, 1)
-    image = _gray(0.70 + 0.06 * stripes, (0.98, 0.95, 0.82))
-    motif = (np.mod(x * 4 + 0.25, 1) - 0.5) ** 2 + (np.mod(y * 4 + 0.5 * np.floor(x * 4 + 0.25), 1) - 0.5) ** 2
-    petals = motif < 0.05 * (1 + 0.4 * np.cos(5 * np.arctan2(np.mod(y * 4, 1) - 0.5, np.mod(x * 4, 1) - 0.5)))
-    image[petals] *= (0.72, 0.55, 0.55)
-    return image + 0.03 * fractal(rng, 0.8, 2, 100)[..., None]
+    image = _gray(0.72 + 0.025 * np.clip(4 * np.sin(2 * np.pi * 8 * x), -1, 1), (1.0, 0.96, 0.87))
+    column = np.floor(x * 4).astype(int)
+    down = np.mod(y * 4 + 0.5 * (column % 2), 4)
+    u, v = np.mod(x * 4, 1) - 0.5, np.mod(down, 1) - 0.5
+    lean, spread, tint = rng.uniform(-1, 1, (3, 4, 4))[:, np.floor(down).astype(int), column]
+    u = u - 0.25 * lean * (0.3 - v)
+    image[(np.abs(u - 0.03 * np.sin(9 * v)) < 0.014) & (np.abs(v) < 0.34)] *= (0.50, 0.52, 0.46)
+    leaf = np.stack([0.50 + 0.12 * tint, 0.56 + 0.10 * tint, 0.47 + 0.11 * tint], axis=-1)
+    for k in range(4):
+        for side in (-1, 1):
+            a, b = side * u, 0.20 - 0.14 * k - v  # along the leaf's axis, which rises by 45 degrees
+            along, across = (a + b) / np.sqrt(2) - 0.13, (b - a) / np.sqrt(2)
+            inside = (along / (0.115 + 0.02 * spread)) ** 2 + (across / (0.05 - 0.015 * side * lean)) ** 2 < 1
+            image[inside] *= leaf[inside] * (1.04 if k % 2 else 0.92)
+    return image + 0.035 * fractal(rng, 0.8, 2, 100)[..., None]
 
 
 def _wood(rng: np.random.Generator) -> Image:
+    """Oak: slowly wandering year rings, seen along the grain, and fine pores."""
     _, y = _grid()
-    warp = 0.05 * fractal(rng, 1.5, 1, 8)
-    rings = np.sin(2 * np.pi * (y * 12 + 6 * warp + 1.5 * fractal(rng, 1.6, 1, 10, 6)))
-    grain = fractal(rng, 0.6, 4, 160, 9)
-    return _gray(0.55 + 0.07 * rings + 0.05 * grain, (1.0, 0.74, 0.5))
+    rings = np.mod(y * 9 + 0.9 * fractal(rng, 1.5, 1, 8, 5), 1.0)
+    grain, pores = fractal(rng, 0.7, 6, 200, 10), fractal(rng, 0.2, 40, 250, 14)
+    return _gray(0.62 - 0.12 * rings**2 + 0.06 * grain - 0.05 * np.maximum(pores - 0.8, 0), (1.0, 0.79, 0.57))
 
 
 def _parquet(rng: np.random.Generator) -> Image:
@@ -73,31 +84,39 @@ def _parquet(rng: np.random.Generator) -> Image:
     row = np.floor(y * 8).astype(int)
     shifted = np.mod(x + rng.random(8)[row], 1.0)
     column = np.floor(shifted * 2).astype(int)
-    tone = rng.uniform(0.75, 1.15, (8, 2))[row, column]
-    image = _wood(rng) * tone[..., None]
+    tone = rng.uniform(0.8, 1.12, (8, 2))[row, column]
+    cut = rng.integers(SIZE, size=(2, 8, 2))[:, row, column]  # every plank is of another part of the wood
+    wood = _wood(rng)[tuple(np.mod(np.indices((SIZE, SIZE)) + cut, SIZE))]
+    image = wood * tone[..., None] * (0.97, 0.92, 0.86)
     gap = (np.mod(y * 8, 1) < 0.03) | (np.mod(shifted * 2, 1) < 0.008)
     image[gap] *= 0.45
     return image
 
 
 def _rug(rng: np.random.Generator) -> Image:
+    """Woven rug: borders around a field of diamonds in madder, indigo, ochre and wool."""
     x, y = _grid()
     u, v = np.abs(x - 0.5) * 2, np.abs(y - 0.5) * 2
-    ring = np.floor(np.maximum(u, v) * 7).astype(int)
-    palette = rng.uniform(0.15, 0.85, (8, 3)) * (1.0, 0.75, 0.65)
-    image = palette[np.clip(ring, 0, 7)]
-    diamond = np.mod(np.abs(np.mod(x * 8, 1) - 0.5) + np.abs(np.mod(y * 8, 1) - 0.5), 0.5) < 0.22
-    image[diamond] = 0.55 * image[diamond] + 0.45 * palette[(ring[diamond] + 3) % 8]
+    ring = np.searchsorted((0.58, 0.63, 0.80, 0.85, 0.94), np.maximum(u, v))
+    wool = np.array([(0.47, 0.23, 0.19), (0.68, 0.60, 0.47), (0.22, 0.26, 0.33), (0.62, 0.47, 0.29)])
+    image = wool[np.array([0, 1, 2, 3, 0, 2])[ring]]
+    diamond = np.abs(np.mod(x * 12, 1) - 0.5) + np.abs(np.mod(y * 12, 1) - 0.5)
+    image[(diamond < 0.3) & np.isin(ring, (0, 2, 4))] = 0.8 * wool[1]
+    image[(diamond < 0.14) & np.isin(ring, (0, 2, 4))] = wool[2]
+    medallion = np.hypot(u, v) + 0.04 * np.cos(8 * np.arctan2(y - 0.5, x - 0.5))
+    for radius, color in ((0.42, 2), (0.37, 3), (0.30, 1), (0.22, 0), (0.10, 1)):
+        image[medallion < radius] = wool[color]
     return image * (1 + 0.10 * fractal(rng, 0.3, 20, 200)[..., None])
 
 
 def _checks(rng: np.random.Generator) -> Image:
+    """Tiles of dark and pale stone."""
     x, y = _grid()
     column, row = np.floor(x * 8).astype(int), np.floor(y * 8).astype(int)
     dark = (column + row) % 2 == 0
-    tone = np.where(dark, 0.28, 0.78) * rng.uniform(0.85, 1.15, (8, 8))[row, column]
-    image = _gray(tone + 0.02 * fractal(rng, 0.8, 2, 60))
-    image[(np.mod(x * 8, 1) < 0.03) | (np.mod(y * 8, 1) < 0.03)] = 0.5
+    tone = np.where(dark, 0.27, 0.77) * rng.uniform(0.88, 1.12, (8, 8))[row, column]
+    image = _gray(tone + 0.025 * fractal(rng, 0.8, 2, 60), (1.0, 0.97, 0.91))
+    image[(np.mod(x * 8, 1) < 0.03) | (np.mod(y * 8, 1) < 0.03)] = (0.52, 0.50, 0.47)
     return image
 
 
@@ -107,72 +126,37 @@ def _brick(rng: np.random.Generator) -> Image:
     shifted = np.mod(x + 0.0625 * (row % 2), 1.0)
     column = np.floor(shifted * 8).astype(int)
     tone = rng.uniform(0.7, 1.2, (16, 8))[row, column]
-    image = _gray(0.55 * tone * (1 + 0.12 * fractal(rng, 0.5, 4, 150)), (1.0, 0.55, 0.42))
+    image = _gray(0.55 * tone * (1 + 0.12 * fractal(rng, 0.5, 4, 150)), (1.0, 0.62, 0.50))
     image[(np.mod(y * 16, 1) < 0.14) | (np.mod(shifted * 8, 1) < 0.07)] = 0.68
     return image
-
-
-def _poster(rng: np.random.Generator) -> Image:
-    x, y = _grid()
-    image = np.empty((SIZE, SIZE, 3))
-    for quarter in range(4):
-        top, left = HALF * (quarter // 2), HALF * (quarter % 2)
-        rows, columns = slice(top, top + HALF), slice(left, left + HALF)
-        u, v = np.mod(x * 2, 1)[rows, columns], np.mod(y * 2, 1)[rows, columns]
-        ground = rng.uniform(0.2, 0.95, 3)
-        part = np.broadcast_to(ground, (*u.shape, 3)) * (0.7 + 0.5 * v[..., None])
-        for _ in range(14):
-            cx, cy, size = *rng.random(2), rng.uniform(0.03, 0.2)
-            color = rng.uniform(0, 1, 3)
-            angle = rng.uniform(0, np.pi)
-            a = (u - cx) * np.cos(angle) + (v - cy) * np.sin(angle)
-            b = (v - cy) * np.cos(angle) - (u - cx) * np.sin(angle)
-            inside = np.hypot(a, b) < size if rng.random() < 0.5 else (np.abs(a) < size) & (np.abs(b) < size * 0.35)
-            part = np.where(inside[..., None], color, part)
-        for line in range(5):
-            upper = 0.74 + 0.045 * line
-            ink = (v > upper) & (v < upper + 0.022) & (u > 0.1) & (u < rng.uniform(0.6, 0.92))
-            letters = rng.random(64)[np.clip((u * 64).astype(int), 0, 63)] > 0.3
-            part = np.where((ink & letters)[..., None], 0.05, part)
-        frame = (np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v)) < 0.03)[..., None]
-        image[rows, columns] = np.where(frame, 0.12, part)
-    return image
-
-
-def _books(rng: np.random.Generator) -> Image:
-    x, y = _grid()
-    image = np.full((SIZE, SIZE, 3), 0.12)
-    for part, v in zip(np.split(image, 4), np.split(np.mod(y * 4, 1), 4), strict=True):
-        left = 0.0
-        while left < 1.0:
-            width, height = rng.uniform(0.018, 0.05), rng.uniform(0.62, 0.94)
-            book = slice(*np.searchsorted(x[0], (left, left + width)))  # columns, beginning with the first at or after
-            pixels, across, up = part[:, book], x[: len(part), book], v[:, book]
-            spine = up > 1 - height
-            pixels[spine] = rng.uniform(0.1, 0.9, 3)
-            label = rng.uniform(0.35, 0.6)
-            band = np.abs(up - 1 + height * label) < 0.07
-            band &= spine & (across > left + 0.2 * width) & (across < left + 0.8 * width)
-            pixels[band] = rng.uniform(0.5, 1.0, 3)
-            pixels[spine & (across < left + 0.0035)] *= 0.4
-            left += width
-    return image * (1 + 0.04 * fractal(rng, 0.5, 4, 100)[..., None])
 
 
 def _stripes(rng: np.random.Generator) -> Image:
     x, y = _grid()
     widths = np.cumsum(rng.uniform(0.5, 2.0, 24))
     band = np.searchsorted(widths / widths[-1], y, side="left").clip(0, 23)
-    palette = rng.uniform(0.2, 0.95, (6, 3))
+    yarn = np.array([
+        (0.82, 0.77, 0.68), (0.34, 0.42, 0.50), (0.72, 0.70, 0.64), (0.52, 0.57, 0.47), (0.80, 0.74, 0.62),
+        (0.58, 0.40, 0.33),
+    ])  # fmt: skip
     weave = 1 + 0.05 * np.sin(2 * np.pi * 64 * x) * np.sin(2 * np.pi * 64 * y)
-    return palette[band % 6] * (weave + 0.05 * fractal(rng, 0.6, 2, 80))[..., None]
+    return yarn[band % 6] * (weave + 0.05 * fractal(rng, 0.6, 2, 80))[..., None]
 
 
 def _plaid(rng: np.random.Generator) -> Image:
-    x, y = _grid()
-    a, b = rng.uniform(0.35, 1.0, (16, 3)), rng.uniform(0.35, 1.0, (16, 3))
-    image = a[np.floor(x * 16).astype(int)] * b[np.floor(y * 16).astype(int)] * 1.1
+    """Tartan: warp and weft of the same bands of wool, woven as a twill."""
+    wool = np.array([(0.62, 0.58, 0.50), (0.36, 0.41, 0.42), (0.74, 0.70, 0.62), (0.46, 0.33, 0.29)])
+    bands = wool[np.array([0, 0, 1, 1, 1, 2, 1, 1, 1, 0, 0, 0, 3, 2, 3, 0])].repeat(SIZE // 16, axis=0)
+    row, column = np.indices((SIZE, SIZE))
+    over = np.where((row + column) // 2 % 2 == 0, 0.7, 0.3)[..., None]
+    image = over * bands[None] + (1 - over) * bands[:, None]
     return image * (1 + 0.05 * fractal(rng, 0.6, 2, 100)[..., None])
+
+
+def _linen(rng: np.random.Generator) -> Image:
+    """Plain cloth: thick and thin threads along both directions."""
+    threads = fractal(rng, 0.4, 8, 200, 12) + fractal(rng, 0.4, 8, 200, 12).T
+    return _gray(0.68 + 0.045 * threads + 0.03 * fractal(rng, 1.2, 1, 8), (1.0, 0.97, 0.92))
 
 
 def _keyboard(rng: np.random.Generator) -> Image:
@@ -182,17 +166,6 @@ def _keyboard(rng: np.random.Generator) -> Image:
     image = _gray(np.where(key, 0.3, 0.08))
     letters = rng.random((48, 128))[np.floor(y * 48).astype(int), np.floor(x * 128).astype(int)] > 0.55
     image[key & (np.abs(u - 0.4) < 0.2) & (np.abs(v - 0.4) < 0.2) & letters] = 0.85
-    return image
-
-
-def _paper(rng: np.random.Generator) -> Image:
-    x, y = _grid()
-    image = np.full((SIZE, SIZE, 3), 0.92)
-    lines = rng.uniform(0.55, 0.95, 32)[np.floor(y * 32).astype(int)]
-    letters = rng.random((32, 128))[np.floor(y * 32).astype(int), np.floor(x * 128).astype(int)] > 0.35
-    image[(np.mod(y * 32, 1) > 0.4) & (x > 0.08) & (x < lines) & letters] = 0.15
-    figure = (x > 0.5) & (x < 0.9) & (y > 0.3) & (y < 0.55)
-    image[figure] = 0.5 + 0.25 * fractal(rng, 1.2, 2, 40)[figure][:, None] * (0.3, 0.6, 1.0)
     return image
 
 
@@ -207,21 +180,22 @@ def _paving(rng: np.random.Generator) -> Image:
 
 
 def _cardboard(rng: np.random.Generator) -> Image:
-    x, y = _grid()
-    image = _gray(0.6 + 0.03 * fractal(rng, 0.7, 2, 100, 4), (1.0, 0.78, 0.55))
-    image[np.abs(y - 0.5) < 0.05] *= (1.2, 1.2, 1.3)
-    label = (np.abs(x - 0.3) < 0.15) & (np.abs(y - 0.25) < 0.1)
-    letters = rng.random((64, 64))[np.floor(y * 64).astype(int), np.floor(x * 64).astype(int)] > 0.5
-    image[label] = 0.92
-    image[label & letters & (np.mod(y * 32, 1) > 0.5)] = 0.1
-    image[(np.hypot(x - 0.75, y - 0.75) < 0.12) & (np.hypot(x - 0.75, y - 0.75) > 0.08)] = (0.7, 0.15, 0.1)
-    return image
+    return prints.carton(SIZE) * (1 + 0.05 * fractal(rng, 0.7, 2, 100, 4)[..., None])
+
+
+def _poster(rng: np.random.Generator) -> Image:
+    """Lithographs: the stone leaves its grain in the colour."""
+    return prints.posters(rng, SIZE) * (1 + 0.06 * fractal(rng, 0.9, 3, 40)[..., None])
+
+
+def _books(rng: np.random.Generator) -> Image:
+    return prints.books(rng, SIZE) * (1 + 0.04 * fractal(rng, 0.5, 4, 100)[..., None])
 
 
 _MAKERS: dict[str, Maker] = {
     "cloud": _noise(0.5, (0.22, 1.2, 1, 24)),  # first: the shading kernel uses texture 0 for large-scale variation
     "plain": _plain,
-    "plaster": _noise(0.76, (0.035, 0.7, 2, 60), (0.03, 1.0, 1, 12)),
+    "plaster": _noise(0.76, (0.035, 0.7, 2, 60), (0.03, 1.0, 1, 12), color=(1.0, 0.985, 0.95)),
     "wallpaper": _wallpaper,
     "wood": _wood,
     "parquet": _parquet,
@@ -235,10 +209,11 @@ _MAKERS: dict[str, Maker] = {
     "denim": _noise(0.62, (0.08, 0.5, 3, 120, 3), (0.08, 1.2, 1, 8)),
     "skin": _noise(0.78, (0.04, 1.0, 1, 40), color=(1.0, 0.8, 0.68)),
     "keyboard": _keyboard,
-    "paper": _paper,
-    "grass": _noise(0.42, (0.09, 0.4, 4, 200), (0.07, 1.0, 1, 12), color=(0.7, 1.0, 0.45)),
+    "paper": lambda rng: prints.paper(rng, SIZE),
+    "grass": _noise(0.42, (0.09, 0.4, 4, 200), (0.07, 1.0, 1, 12), color=(0.78, 0.95, 0.52)),
     "paving": _paving,
     "cardboard": _cardboard,
+    "linen": _linen,
 }
 TEXTURES = tuple(_MAKERS)
 

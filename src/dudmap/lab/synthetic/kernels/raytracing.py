@@ -247,8 +247,8 @@ def texture_color(atlas, texture, level, u, v):
 def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textures, atlas, lights, up, focal):
     """Colour (0..1, three numbers) and cosine of incidence of primitive p at the hit (x, y, 1) t of a ray.
 
-    Textures are projected along the largest normal component, with mip maps. Light: Lambert's law plus a hemisphere.
-    See Renderer for the columns of materials and lights.
+    Textures are projected along the largest normal component, with mip maps, and not mirrored on upright faces. Light:
+    Lambert's law, softened, plus a hemisphere. See Renderer for the columns of materials and lights.
     """
     X, Y = x * t, y * t
     px = rotations[p, 0, 0] * X + rotations[p, 0, 1] * Y + rotations[p, 0, 2] * t + origins[p, 0]
@@ -262,9 +262,9 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
 
     ax, ay, az = abs(lx), abs(ly), abs(lz)
     if ax >= ay and ax >= az:
-        s, w, side = py, -pz, 0.37 * np.sign(lx)
+        s, w, side = py * np.sign(lx), -pz, 0.37 * np.sign(lx)
     elif ay >= az:
-        s, w, side = px, -pz, 0.71 * np.sign(ly)
+        s, w, side = -px * np.sign(ly), -pz, 0.71 * np.sign(ly)
     else:
         s, w, side = px, -py, 0.0
     u, v = s * materials[p, 0] + materials[p, 2] + side * materials[p, 9], w * materials[p, 1] + materials[p, 3]
@@ -284,7 +284,8 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
     for k in range(lights.shape[0]):
         ex, ey, ez = lights[k, 0] - X, lights[k, 1] - Y, lights[k, 2] - t
         squared = ex * ex + ey * ey + ez * ez
-        facing = max((ex * nx + ey * ny + ez * nz) / np.sqrt(squared), 0.0)
+        facing = (ex * nx + ey * ny + ez * nz) / np.sqrt(squared)
+        facing = max((facing + lights[k, 5]) / (1.0 + lights[k, 5]), 0.0)
         light += lights[k, 3] * facing / (1.0 + squared * lights[k, 4])
     light += up[3] * (0.75 + 0.25 * (nx * up[0] + ny * up[1] + nz * up[2])) + materials[p, 8]
     gain = light * variation * (1.0 / 255.0)
