@@ -90,6 +90,20 @@ def test_what_a_task_holds_is_let_go_once_it_is_done():
 
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_what_bands_hold_is_let_go_while_the_threads_wait():
+    class Data:
+        pass
+
+    data = Data()
+    held = weakref.ref(data)
+    threads.run_bands(lambda start, stop, data=data: (start, stop), threads.bands(100, 7))
+    del data
+    late = time.monotonic() + 30
+    while held() is not None and time.monotonic() < late:
+        time.sleep(0.01)
+    assert held() is None
+
+
 def test_a_forked_process_has_threads_of_its_own():
     expected = squares(100)
     context = multiprocessing.get_context("fork")

@@ -120,6 +120,7 @@ def _tasks() -> SimpleQueue[Callable[[], object] | None]:
     def work() -> None:
         while (task := tasks.get()) is not None:
             task()
+            del task  # with its data, while the thread waits for the next
 
     def stop() -> None:
         for _ in threads:
