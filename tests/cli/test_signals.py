@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -144,8 +145,9 @@ def test_sigterm_ends_a_run_and_names_how_to_go_on(room, tmp_path):
 
 
 PROGRAM = """
-import select, sys
+import select, signal, sys
 from dudmap import interruption
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in the background
 interruption.listen()
 try:
     with interruption.postponed():
@@ -166,6 +168,8 @@ def program(*signals, pause=0.0, completes=True):
     """Exit code and output of a program that is sent signals while it writes, which it completes or never does."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     process = subprocess.Popen([sys.executable, "-c", PROGRAM], **pipes)
+    limit = threading.Timer(60, process.kill)
+    limit.start()
     assert process.stdout.readline() == "ready\n"
     for n, number in enumerate(signals):
         process.send_signal(number)
@@ -179,6 +183,7 @@ def program(*signals, pause=0.0, completes=True):
     said = process.stdout.read()
     process.stdin.close()
     process.stdout.close()
+    limit.cancel()
     return process.wait(timeout=60), [line for line in said.splitlines() if line != "taken"]
 
 
