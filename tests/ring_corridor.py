@@ -18,9 +18,8 @@ CORNER = 1.1
 EYES = 1.45
 """Height of the camera, metres."""
 WALLS, FLOORS = ("wallpaper", "brick", "plaster", "wood"), ("checks", "parquet", "wood")
-"""Textures. Each surface has its own part and its own scale of one, across and down: in the same scale the few pictures
-would repeat exactly, and a place could not be told from the one a period farther on, which no building asks for. Wear
-and stains darken and lighten each by up to a third."""
+"""Textures. Each surface has its own part and scale of one. With equal scales the few pictures repeat exactly, and two
+places look alike. Wear and stains darken and lighten each by up to a third."""
 
 
 def ring_corridor(
